@@ -1,7 +1,7 @@
 /* python.c - the core as the extension module `cangauge._core`.
  *
- * A model and settings come in as bytes in the layout of cangauge.h: estimation/core_layout.py names
- * their fields, and SIZES proves that both agree. The state is known to C alone.
+ * Constants of a model and settings come in by the names of their fields in cangauge.h, as arrays of
+ * doubles (estimation/core_constants.py). The state is known to C alone.
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -27,28 +27,120 @@ typedef struct {
     PyObject *reasons; /* by their bits */
 } Core;
 
+/* ------------------------------------------------------------------ constants by name */
+
+/* Place of a field: a number, or an array of rows of columns. */
+typedef struct {
+    const char *name;
+    size_t offset;
+    bool is_integer;
+    Py_ssize_t rows;
+    Py_ssize_t columns;
+    size_t stride;
+} field;
+
+#define SIZE(of, name) sizeof(((of *)NULL)->name)
+#define INTEGER(of, name) {#name, offsetof(of, name), true, 1, 1, 0}
+#define REAL(of, name)                                                                             \
+    {#name, offsetof(of, name), false, SIZE(of, name) / sizeof(double), 1, sizeof(double)}
+#define TABLE(of, name)                                                                            \
+    {#name, offsetof(of, name), false, SIZE(of, name) / SIZE(of, name[0]),                         \
+     SIZE(of, name[0]) / sizeof(double), SIZE(of, name[0])}
+#define OF_EFFECTS(name, is_integer, columns)                                                      \
+    {"effect_" #name, offsetof(cg_model, effect[0].name), is_integer, CG_EFFECTS, columns,         \
+     sizeof(cg_effect)}
+#define END {NULL, 0, false, 0, 0, 0}
+
+static const field MODEL_FIELDS[] = {
+    REAL(cg_model, ocv_v), REAL(cg_model, epsilon), REAL(cg_model, slope_beyond),
+    INTEGER(cg_model, knots), REAL(cg_model, knot_pct), REAL(cg_model, knot_v),
+    REAL(cg_model, knot_slope), REAL(cg_model, t_ref_c), REAL(cg_model, temperature_limits_c),
+    INTEGER(cg_model, delays), REAL(cg_model, delay_s), INTEGER(cg_model, low_passes),
+    REAL(cg_model, low_pass_s), INTEGER(cg_model, has_arrhenius), REAL(cg_model, arrhenius_ohm),
+    REAL(cg_model, arrhenius_mean), REAL(cg_model, usual_c), REAL(cg_model, load),
+    REAL(cg_model, soc_range_pct), REAL(cg_model, temperature_range_c),
+    REAL(cg_model, current_range_a), REAL(cg_model, rate_hz), REAL(cg_model, capacity_ah),
+    REAL(cg_model, charge_efficiency), REAL(cg_model, initial_offset_pct),
+    REAL(cg_model, nominal_v), REAL(cg_model, level_std_v), REAL(cg_model, slow_std_v),
+    REAL(cg_model, slow_time_s), REAL(cg_model, fast_std_v), REAL(cg_model, soc_std_pct),
+    REAL(cg_model, cold_exponent), REAL(cg_model, residual_std_v), REAL(cg_model, block_s),
+    INTEGER(cg_model, tested_blocks), REAL(cg_model, innovations_at_most),
+    REAL(cg_model, strain_at_most), INTEGER(cg_model, functions),
+    INTEGER(cg_model, function_knots), REAL(cg_model, function_pct), TABLE(cg_model, function_v),
+    TABLE(cg_model, function_slope), TABLE(cg_model, function_load), INTEGER(cg_model, effects),
+    OF_EFFECTS(kind, true, 1), OF_EFFECTS(value, false, CG_VALUES),
+    OF_EFFECTS(tau_s, false, CG_LAGS), REAL(cg_model, skew_s), END,
+};
+
+static const field SETTINGS_FIELDS[] = {
+    INTEGER(cg_settings, method), REAL(cg_settings, initial_soc_pct),
+    REAL(cg_settings, initial_soc_std_pct), REAL(cg_settings, valid_std_pct),
+    REAL(cg_settings, gap_s), INTEGER(cg_settings, reasons), REAL(cg_settings, full_voltage_v),
+    REAL(cg_settings, full_current_a), REAL(cg_settings, full_hold_s),
+    REAL(cg_settings, full_soc_pct), REAL(cg_settings, full_soc_std_pct),
+    REAL(cg_settings, rest_after_s), REAL(cg_settings, rest_soc_std_pct), END,
+};
+
+/* Fill one field from an array of doubles. False: it is none, or larger than the field. */
+static bool fill(char *structure, const field *at, const Py_buffer *values)
+{
+    const Py_ssize_t rows = (values->ndim > 0) ? values->shape[0] : 1;
+    const Py_ssize_t columns = (values->ndim > 1) ? values->shape[1] : 1;
+    const double *value = values->buf;
+    if ((values->itemsize != (Py_ssize_t)sizeof(double)) || (values->ndim > 2) ||
+        (rows > at->rows) || (columns > at->columns)) {
+        return false;
+    }
+    for (Py_ssize_t row = 0; row < rows; ++row) {
+        char *to = structure + at->offset + ((size_t)row * at->stride);
+        if (at->is_integer) {
+            const int32_t number = (int32_t)*value++;
+            memcpy(to, &number, sizeof(number));
+        } else {
+            memcpy(to, value, (size_t)columns * sizeof(double));
+            value += columns;
+        }
+    }
+    return true;
+}
+
+/* Fill a structure from arrays by name. False: an error is set. */
+static bool fill_all(void *structure, const field *fields, PyObject *arrays)
+{
+    PyObject *name;
+    PyObject *array;
+    Py_ssize_t next = 0;
+    while (!PyErr_Occurred() && PyDict_Next(arrays, &next, &name, &array)) {
+        Py_buffer values;
+        const field *at = fields;
+        while ((at->name != NULL) && (PyUnicode_CompareWithASCIIString(name, at->name) != 0)) {
+            ++at;
+        }
+        if (PyObject_GetBuffer(array, &values, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS) == 0) {
+            if ((at->name == NULL) || !fill(structure, at, &values)) {
+                PyErr_Format(PyExc_ValueError, "the core has no place for %S", name);
+            }
+            PyBuffer_Release(&values);
+        }
+    }
+    return PyErr_Occurred() == NULL;
+}
+
 static int begin(Core *self, PyObject *args)
 {
-    Py_buffer model, settings;
-    PyObject *estimate, *statuses, *reasons;
+    PyObject *model, *settings, *estimate, *statuses, *reasons;
     int size, block;
     double spacing_s;
-    cg_settings of_user;
-    if (!PyArg_ParseTuple(args, "y*y*iidO!O!O", &model, &settings, &size, &block, &spacing_s,
-                          &PyType_Type, &estimate, &PyTuple_Type, &statuses, &reasons)) {
+    cg_settings of_user = {0};
+    if (!PyArg_ParseTuple(args, "O!O!iidO!O!O", &PyDict_Type, &model, &PyDict_Type, &settings,
+                          &size, &block, &spacing_s, &PyType_Type, &estimate, &PyTuple_Type,
+                          &statuses, &reasons) ||
+        !fill_all(&self->model, MODEL_FIELDS, model) ||
+        !fill_all(&of_user, SETTINGS_FIELDS, settings)) {
         return -1;
     }
-    const bool fits = (model.len == (Py_ssize_t)sizeof(cg_model)) &&
-                      (settings.len == (Py_ssize_t)sizeof(cg_settings)) && (size > 0) &&
-                      PyType_IsSubtype((PyTypeObject *)estimate, &PyTuple_Type);
-    if (fits) {
-        memcpy(&self->model, model.buf, sizeof(cg_model));
-        memcpy(&of_user, settings.buf, sizeof(cg_settings));
-    }
-    PyBuffer_Release(&model);
-    PyBuffer_Release(&settings);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "constants of another layout");
+    if ((size <= 0) || !PyType_IsSubtype((PyTypeObject *)estimate, &PyTuple_Type)) {
+        PyErr_SetString(PyExc_ValueError, "a delay line and a tuple's type are needed");
         return -1;
     }
     const bool has_skew = cg_skew_of(&self->model) < self->model.effects;
@@ -417,14 +509,10 @@ PyMODINIT_FUNC PyInit__core(void)
         return NULL;
     }
     PyObject *module = PyModule_Create(&MODULE);
-    PyObject *sizes = Py_BuildValue("{s:n,s:n}", "model", sizeof(cg_model), "settings",
-                                    sizeof(cg_settings));
-    if ((module == NULL) || (sizes == NULL) ||
+    if ((module == NULL) ||
         (PyModule_AddObjectRef(module, "Core", (PyObject *)&CoreType) < 0) ||
-        (PyModule_AddObjectRef(module, "SIZES", sizes) < 0) ||
         (PyModule_AddStringConstant(module, "SOURCES", CG_SOURCES) < 0)) {
         Py_CLEAR(module);
     }
-    Py_XDECREF(sizes);
     return module;
 }

@@ -187,6 +187,16 @@ def test_environment_switches_the_core_off(monkeypatch: pytest.MonkeyPatch) -> N
     assert type(make_estimator(KNOTS)) is Estimator
 
 
-def test_constants_of_another_layout_are_refused() -> None:
-    with pytest.raises(ValueError, match="layout"):
-        core.Core(b"", b"", 1, 0, 1.0, tuple, (), {})
+@pytest.mark.parametrize(
+    "constants", [{"colour": np.ones(1)}, {"delay_s": np.ones(65)}, {"load": np.ones((2, 2))}]
+)
+def test_constants_that_the_core_has_no_place_for_are_refused(constants: Any) -> None:
+    with pytest.raises(ValueError, match=f"no place for {next(iter(constants))}"):
+        core.Core(constants, {}, 1, 0, 1.0, tuple, (), {})
+
+
+def test_a_model_beyond_the_cores_memory_is_estimated_in_python() -> None:
+    raw = KNOTS.model_dump()
+    raw["loads"] |= {"delays_s": list(range(66)), "resistance_ohm": [-1e-3] * 68, "arrhenius": None}
+    raw["functions"]["load"] = np.zeros((8, 69)).tolist()
+    assert type(make_estimator(Model.model_validate(raw))) is Estimator

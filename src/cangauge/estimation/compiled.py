@@ -12,6 +12,7 @@ import logging
 import os
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, ClassVar, Final, cast
 
@@ -21,7 +22,13 @@ from numpy.typing import NDArray
 from cangauge._core_digest import sources_digest
 from cangauge._logging import emit
 from cangauge._typing import FloatArray
-from cangauge.estimation import core_layout as layout
+from cangauge.estimation.core_constants import (
+    KINDS,
+    Constants,
+    core_forms,
+    model_constants,
+    settings_constants,
+)
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.delay_line import BLOCK, SPACING_S, DelayLine
@@ -39,10 +46,7 @@ def _load(root: Path) -> Any:
     except ImportError:  # no compiler at installation
         return None
     folder = root / "core"
-    is_stale = (folder / "cangauge.h").is_file() and sources_digest(folder) != core.SOURCES
-    if is_stale or any(
-        getattr(layout, name.upper()).itemsize != size for name, size in core.SIZES.items()
-    ):
+    if (folder / "cangauge.h").is_file() and sources_digest(folder) != core.SOURCES:
         emit(
             _LOG,
             logging.WARNING,
@@ -70,11 +74,11 @@ def make_estimator(model: Model, settings: EstimatorSettings | None = None) -> E
     model : Model
     settings : EstimatorSettings, optional
     """
-    settings = settings or EstimatorSettings()
     if is_compiled():
-        forms = layout.core_forms(model.online(settings.capacity_ah, settings.gap_s))
-        if forms is not None:
-            return CompiledEstimator(model, settings, forms)
+        try:
+            return CompiledEstimator(model, settings)
+        except ValueError as lacking:  # an effect, or a place for so many numbers
+            emit(_LOG, logging.INFO, "core.lacking", f"estimating in Python: {lacking}")
     return Estimator(model, settings)
 
 
@@ -85,24 +89,27 @@ class CompiledEstimator(Estimator):
     ----------
     model : Model
     settings : EstimatorSettings
-    forms : list of CoreForm
-        The model's effects in the core.
 
     Attributes
     ----------
     native : Core
         The estimator in C.
+
+    Raises
+    ------
+    ValueError
+        If the core lacks an effect of the model, or has no place for its numbers.
     """
 
     core: ClassVar[str] = "compiled"
     _release: ClassVar[str] = getattr(_core, "SOURCES", "")
 
-    def __init__(self, model: Model, settings: EstimatorSettings, forms: list[CoreForm]) -> None:
+    def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
         super().__init__(model, settings)
-        online = self._online
+        online, forms = self.online, core_forms(self.online)
         self.native: Any = _core.Core(
-            layout.model_constants(model, online, forms, self.tests).tobytes(),
-            layout.settings_constants(model, settings).tobytes(),
+            _arrays(model_constants(self, forms) | _of_effects(forms)),
+            _arrays(settings_constants(model, self.settings)),
             int(2.0 * online.delay_line.longest_s / SPACING_S) + 2 * BLOCK,
             BLOCK,
             SPACING_S,
@@ -189,7 +196,22 @@ class CompiledEstimator(Estimator):
         # The reference has the drives of effects beside the SoC in one sum.
         over, drives = self._is_over_soc, view["drives"]
         by_reference = np.array([sum(drives[~over].tolist()), *drives[over].tolist()])
-        self._online.resume(view["load"], by_reference, view["low_passed"].tolist())
+        self.online.resume(view["load"], by_reference, view["low_passed"].tolist())
+
+
+def _of_effects(forms: list[CoreForm]) -> Constants:
+    """Return the fields of the effects, a row for each."""
+    columns = zip_longest(*(form.values for form in forms), fillvalue=0.0)
+    lags = zip_longest(*(form.tau_s for form in forms), fillvalue=0.0)
+    return {
+        "effect_kind": [KINDS.index(form.kind) for form in forms],
+        "effect_value": list(zip(*columns, strict=True)),
+        "effect_tau_s": list(zip(*lags, strict=True)),
+    }
+
+
+def _arrays(constants: Constants) -> dict[str, FloatArray]:
+    return {name: np.ascontiguousarray(each, np.float64) for name, each in constants.items()}
 
 
 class _CoreLine(DelayLine):

@@ -127,19 +127,19 @@ class Estimator:
     def __init__(self, model: Model | Any, settings: EstimatorSettings | None = None) -> None:
         self.model: Model = as_model(model)
         self.settings = settings or EstimatorSettings()
-        self._online = self.model.online(
+        self.online = self.model.online(
             self.settings.capacity_ah, self.settings.gap_s, self.settings.voltage_accuracy_pct
         )
-        self.capacity_ah = self._online.capacity_ah
-        self.voltage_model: VoltageModel = self._online.model
-        self.hypotheses = Hypotheses(self._online)
+        self.capacity_ah = self.online.capacity_ah
+        self.voltage_model: VoltageModel = self.online.model
+        self.hypotheses = Hypotheses(self.online)
         self._clock = EstimatorClock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._block = BlockState()
         self._memory = EstimatorMemory()
-        self._power = PowerModel(self._online, self.settings.limits)
+        self._power = PowerModel(self.online, self.settings.limits)
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
-        strain_at_most = float(chdtri(self._online.functions.number + 4, ALARM))
+        strain_at_most = float(chdtri(self.online.functions.number + 4, ALARM))
         self.tests = tested, float(chdtri(tested, ALARM)), strain_at_most
         self._mismatch = temperature_mismatch(
             self.model.temperature_source, self.settings.temperature_source
@@ -150,7 +150,7 @@ class Estimator:
         # Sample, stamp and reasons of an estimate that is not computed yet; None: it is computed.
         self._pending: tuple[Sample, float, Reason] | None = None
         if self.settings.initial_soc_pct is not None:
-            soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
+            soc_pct = self.online.initial_soc_pct(self.settings.initial_soc_pct)
             self._start(soc_pct, self.settings.initial_soc_std_pct, is_doubtful=True)
 
     # --- samples → estimates
@@ -188,7 +188,7 @@ class Estimator:
         if memory.samples == 0:
             memory.first_s = time_s
         memory.samples += 1
-        corrected = self._online.correct(Reading(*sample))
+        corrected = self.online.correct(Reading(*sample))
         for reading in corrected:
             self._process(Sample(*reading))
         if corrected:
@@ -249,7 +249,7 @@ class Estimator:
         self._refresh()
         if math.isnan(self._counter.time_s):
             return [math.nan] * len(stamps_s)
-        at = self._online.delay_line.current_at
+        at = self.online.delay_line.current_at
         now_a = at(0.0)
         # Cells of one frame share its stamp.
         changes = {each: now_a - at(time_s - each) for each in {*stamps_s} if not math.isnan(each)}
@@ -271,10 +271,10 @@ class Estimator:
         if self._implausible and math.isnan(voltage_v):
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
             block.is_broken = True
-        charge = self._counter.step(time_s, self._online.counted(current_a))
+        charge = self._counter.step(time_s, self.online.counted(current_a))
         if not math.isnan(temperature_c) or charge.away_s:
             memory.temperature_c = temperature_c
-        self._online.advance(time_s, current_a, memory.temperature_c)
+        self.online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
             self._note_gap(time_s, charge)
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
@@ -293,7 +293,7 @@ class Estimator:
         memory, away_s = self._memory, charge.away_s
         self._block.is_broken = True
         memory.row_v = math.nan
-        memory.gap_until_s = time_s + self._online.delay_line.longest_s
+        memory.gap_until_s = time_s + self.online.delay_line.longest_s
         if away_s > 0.0:
             self._predict_to_now()
             self._be_away(away_s, charge.parked_std_pct)
@@ -306,7 +306,7 @@ class Estimator:
 
     def _use_row(self, sample: Sample) -> None:
         """Compare a row's voltage with the model, and add it to the open block."""
-        memory, online, counter = self._memory, self._online, self._counter
+        memory, online, counter = self._memory, self.online, self._counter
         load, load_v, drop_v = self._load()
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
         memory.newton_pct = memory.newton_std_pct = math.nan
@@ -366,7 +366,7 @@ class Estimator:
         was_rejected = hypotheses.is_rejected
         hypotheses.update(block)
         if not hypotheses.is_valid():
-            self.hypotheses = Hypotheses(self._online)
+            self.hypotheses = Hypotheses(self.online)
             memory.contradicted_until_s = time_s + CONTRADICTED_S
         elif hypotheses.is_rejected and not was_rejected:
             memory.contradicted_until_s = time_s + CONTRADICTED_S
@@ -426,7 +426,7 @@ class Estimator:
 
     def _start(self, soc_pct: float, std_pct: float, *, is_doubtful: bool) -> None:
         """Start filter and count from a SoC and its standard deviation [%]."""
-        self.hypotheses = Hypotheses(self._online, soc_pct, std_pct, is_doubtful=is_doubtful)
+        self.hypotheses = Hypotheses(self.online, soc_pct, std_pct, is_doubtful=is_doubtful)
         self._memory.is_known = True
         self._start_count(soc_pct, std_pct)
 
@@ -448,7 +448,7 @@ class Estimator:
 
     def _load(self) -> tuple[FloatArray, float, float]:
         """Return the load row, its voltage, and the part of it by the resistances [V]."""
-        load, theta = self._online.load, self._online.load_coefficients
+        load, theta = self.online.load, self.online.load_coefficients
         return load, float(load @ theta), float(load[1:] @ theta[1:])
 
     def _soc(self) -> tuple[float, float]:
@@ -485,7 +485,7 @@ class Estimator:
         if self._pending is None:
             return self._latest
         (sample, stamp_s, implausible), self._pending = self._pending, None
-        memory, line, time_s = self._memory, self._online.delay_line, sample.time_s
+        memory, line, time_s = self._memory, self.online.delay_line, sample.time_s
         soc_pct, std_pct = self._soc()
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
         bits = int(self._mismatch) | int(implausible)
@@ -612,7 +612,7 @@ class Estimator:
         memory.is_known = False
         self._block = BlockState(before._block.number, is_broken=True)
         self._latest, self._pending, self.is_refused = latest, None, False
-        self._online.take_over(before._online)
+        self.online.take_over(before.online)
         if not math.isnan(latest.soc_pct):
             self._start(latest.soc_pct, latest.soc_std_pct, is_doubtful=False)
         elif not math.isnan(latest.soc_coulomb_pct):  # the inverse has none without a voltage
@@ -628,8 +628,8 @@ class Estimator:
             "block": asdict(self._block),
             "memory": asdict(self._memory),
             "hypotheses": self.hypotheses.state(),
-            "line": self._online.delay_line.contents,
-            "online": self._online.state(),
+            "line": self.online.delay_line.contents,
+            "online": self.online.state(),
             "latest": self._evaluate(),
         }
         return json.dumps(parts).encode()
@@ -642,8 +642,8 @@ class Estimator:
         self._block = BlockState(**parts["block"])
         self._memory = EstimatorMemory(**parts["memory"])
         self.hypotheses.resume(**parts["hypotheses"])
-        self._online.delay_line.fill(*parts["line"])
-        self._online.restore(parts["online"])
+        self.online.delay_line.fill(*parts["line"])
+        self.online.restore(parts["online"])
         *numbers, status, reasons, samples = parts["latest"]
         self._latest = Estimate._make([*numbers, Status(status), Reason(reasons), samples])
         self._pending, self.is_refused = None, False

@@ -9,9 +9,13 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge.errors import InputError
-from cangauge.estimation import core_layout as layout
+from cangauge.estimation.core_constants import (
+    Constants,
+    core_forms,
+    model_constants,
+    settings_constants,
+)
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, VoltageModel
@@ -21,13 +25,16 @@ CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")
 WIDE: Final = ("ocv_v", "epsilon", "golden")
 """Fields that are doubles where the others are floats, and rows of the tests."""
 
+KNOTS: Final = 201
+"""Knots of a table of the published curve: every half per cent, as many as `CG_KNOTS`."""
+
 EDGE_PCT: Final = 1e-3
 """Distance from the identified SoC at which a table has the slope beyond it [%]: the curve has a
 kink there, which a cubic between two knots cannot have."""
 
 
 class TabulatedModel(Model):
-    """A model of the published equation whose curve is a table of `KNOTS` knots.
+    """A model of the published equation whose curve is a table.
 
     The equation has logarithms and negative powers of the SoC, which cost a microcontroller without
     doubles four times as much as all the rest of a voltage update.
@@ -46,7 +53,7 @@ class TabulatedModel(Model):
         if not isinstance(curve, PublishedCurve):
             return voltage
         low, high = voltage.range.soc_pct
-        inside = np.linspace(low, high, layout.KNOTS - 2)
+        inside = np.linspace(low, high, KNOTS - 2)
         soc_pct = np.r_[low - EDGE_PCT, inside, high + EDGE_PCT]
         slope = np.r_[curve.beyond[0], curve.slopes(inside), curve.beyond[1]]
         return replace(voltage, curve=HermiteCurve(soc_pct, curve.values(soc_pct), slope))
@@ -54,19 +61,19 @@ class TabulatedModel(Model):
 
 @dataclass(frozen=True)
 class CoreConstants:
-    """What the core is started with.
+    """Constants that the core is started with.
 
     Parameters
     ----------
-    model, settings : records
-        A `cg_model` and a `cg_settings`.
+    model, settings : Constants
+        Fields of a `cg_model` without its effects, and of a `cg_settings`.
     effects : list of CoreForm
     longest_s : float
         Longest delay [s].
     """
 
-    model: layout.Record
-    settings: layout.Record
+    model: Constants
+    settings: Constants
     effects: list[CoreForm]
     longest_s: float
 
@@ -79,20 +86,21 @@ def exported_constants(model: Model) -> CoreConstants:
     InputError
         If the core lacks one of the model's effects.
     """
-    online = model.online()
-    forms = layout.core_forms(online)
-    if forms is None:
+    estimator = Estimator(model)
+    try:
+        forms = core_forms(estimator.online)
+    except ValueError as lacking:
         raise InputError(
-            "the core has no form of an effect, or the model has time_skew twice",
+            str(lacking),
             field="effects",
             value=[entry["id"] for entry in model.effects],
             cure="fit the model without it",
-        )
+        ) from lacking
     return CoreConstants(
-        layout.model_constants(model, online, forms, Estimator(model).tests),
-        layout.settings_constants(model, EstimatorSettings()),
+        model_constants(estimator, forms),
+        settings_constants(model, estimator.settings),
         forms,
-        online.delay_line.longest_s,
+        estimator.online.delay_line.longest_s,
     )
 
 
@@ -106,14 +114,13 @@ def initialiser(value: Any, field: str = "") -> str:
 
     Parameters
     ----------
-    value : number, record, array, list, tuple or str
-        A string is an expression in C.
+    value : number, dict, array, list, tuple or str
+        A dict is a structure, a string an expression in C.
     field : str
         Field that the value is of.
     """
-    if isinstance(value, np.void):
-        names = value.dtype.names or ()
-        fields = (f".{name} = {initialiser(value[name], name)}" for name in names)
+    if isinstance(value, dict):
+        fields = (f".{name} = {initialiser(each, name)}" for name, each in value.items())
         return "{" + ", ".join(fields) + "}"
     if isinstance(value, np.ndarray | list | tuple):
         return "{" + (", ".join(initialiser(item, field) for item in value) or "0") + "}"
@@ -126,32 +133,13 @@ def initialiser(value: Any, field: str = "") -> str:
 
 def model_definition(name: str, constants: CoreConstants) -> str:
     """Return the definition of a model's constants, a `cg_model`."""
-    of, used = constants.model, used_sizes(constants)
-    lines = []
-    for field in layout.MODEL.names or ():
-        value = of[field]
-        if 0 in used.get(field, ()):
-            continue
-        if field in used:
-            value = value[tuple(slice(size) for size in used[field])]
-        lines.append(f"    .{field} = {initialiser(value, field)},\n")
+    effects = [
+        {"kind": f"CG_{form.kind.upper()}", "value": form.values, "tau_s": form.tau_s}
+        for form in constants.effects
+    ]
+    lines = [
+        f"    .{field} = {initialiser(value, field)},\n"
+        for field, value in (constants.model | {"effect": effects}).items()
+        if np.size(value)
+    ]
     return f"const cg_model {name} = {{\n{''.join(lines)}}};\n"
-
-
-def used_sizes(constants: CoreConstants) -> dict[str, tuple[int, ...]]:
-    """Return the used part of the arrays whose length depends on the model."""
-    of = constants.model
-    currents = int(of["delays"] + of["low_passes"])
-    loads, knots = currents + 1 + int(of["has_arrhenius"]), int(of["knots"])
-    functions, function_knots = int(of["functions"]), int(of["function_knots"])
-    return {
-        "delay_s": (int(of["delays"]),),
-        "low_pass_s": (int(of["low_passes"]),),
-        "arrhenius_ohm": (currents,),
-        "load": (loads,),
-        **dict.fromkeys(("knot_pct", "knot_v", "knot_slope"), (knots,)),
-        "function_pct": (function_knots,),
-        **dict.fromkeys(("function_v", "function_slope"), (function_knots, functions)),
-        "function_load": (loads if functions else 0, functions),
-        "effect": (int(of["effects"]),),
-    }

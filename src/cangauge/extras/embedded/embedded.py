@@ -167,8 +167,8 @@ def _config(constants: CoreConstants, period_s: float) -> str:
     of = constants.model
     skews = [abs(form.values[0]) for form in constants.effects if form.kind == "time_skew"]
     waiting = math.ceil(max(skews) / period_s) + 130 if skews else 1
-    sizes = {name: int(of[name]) for name in ("delays", "low_passes", "functions", "effects")}
-    sizes["knots"], sizes["waiting"] = max(of["knots"], of["function_knots"]), waiting
+    sizes = {name: of[name] for name in ("delays", "low_passes", "functions", "effects")}
+    sizes |= {"knots": max(of["knots"], of["function_knots"]), "waiting": waiting}
     lines = [f"#define CG_{name.upper()} {max(size, 1)}" for name, size in sizes.items()]
     return "\n".join(lines) + "\n"
 

@@ -32,7 +32,6 @@ from cangauge._files import atomic_path
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation import core_layout as layout
 from cangauge.extras.embedded.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
@@ -168,10 +167,7 @@ class _Unit:
                 CoreForm("no_effect") if form.kind in SENSORS else form
                 for form in constants.effects
             ]
-            of = constants.model.copy()
-            for effect, form in zip(of["effect"], forms, strict=False):
-                effect["kind"] = layout.KINDS.index(form.kind)
-            constants = replace(constants, model=of, effects=forms)
+            constants = replace(constants, effects=forms)
             names, parameters = _effect_parameters(forms)
             variables = (*_pack_variables(model), *names)
         else:
