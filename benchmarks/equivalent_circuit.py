@@ -113,7 +113,16 @@ def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) 
     celsius = np.full_like(soc_pct, temperature_c)
     zero = np.zeros_like(soc_pct)
     load = Load(np.arange(soc_pct.size, dtype=np.float64), zero, celsius, zero)
-    return np.asarray(extended.model.pseudo_ocv(soc_pct, celsius) + extended.added_v(load, soc_pct))
+    return extended.model.pseudo_ocv(soc_pct, celsius) + _added_v(extended, load, soc_pct)
+
+
+def _added_v(extended: ExtendedModel, load: Load, soc_pct: FloatArray) -> FloatArray:
+    """Return the sum of the effects' voltages [V], shape (n,)."""
+    every = slice(None)
+    volts = np.zeros_like(soc_pct)
+    for effect, values in extended.effects:
+        volts += effect.added_v(load, every, soc_pct, values, extended)
+    return volts
 
 
 class _StepResponse:
@@ -143,7 +152,7 @@ class _StepResponse:
 
         def volts(amperes: float) -> FloatArray:
             load = Load(time_s, amperes * one, temperature_c * one, amperes * unit_v)
-            added_v = self._extended.added_v(load, soc_pct * one)
+            added_v = _added_v(self._extended, load, soc_pct * one)
             return np.asarray(amperes * unit_v + added_v)
 
         return np.asarray((volts(0.0) - volts(current_a))[1:] / current_a)

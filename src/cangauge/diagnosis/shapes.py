@@ -157,7 +157,7 @@ def steps(pack: Pack) -> list[Shape]:
 def columns(of: Simulated, tried: Sequence[Shape]) -> FloatArray:
     """Return the change of voltage by each shape at its bound [V], shape (m, k)."""
     plain, model = of.plain, of.model
-    rows, pack = of.of.rows, model.pack
+    rows = of.of.rows
     true = plain.signals
     currents = of.model.model.currents(true.time_s, true.current_a, slice(None))
     table = model.model.load_columns(true.temperature_c, currents)
@@ -170,10 +170,7 @@ def columns(of: Simulated, tried: Sequence[Shape]) -> FloatArray:
         shape = each if each.place is None else each.at(each.place, duration_s)
         effect, values = shape.effect, shape.values(shape.about)
         if effect.adds_voltage:
-            drive = effect.drive(load, values, effect.context(values, model.model, pack))
-            if drive is None:
-                raise ValueError("an effect of the voltage has a drive")
-            changed = drive[rows] * effect.over_soc(soc, values, model.model)
+            changed = effect.added_v(load, rows, soc, values, model)
         else:
             changed = plain.residual_v - of.with_effect(effect, values).residual_v
         found[:, k] = changed * (shape.bound / shape.about)

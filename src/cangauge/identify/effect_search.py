@@ -243,7 +243,7 @@ def linearize(
     amplitudes : array of shape (e,)
         Of the model's effects, relative to neutral; 0 without.
     """
-    voltage, pack = model.model, model.pack
+    voltage = model.model
     row, start_pct = start_of(log)
     signals = Signals.of(dequantize(log))
     currents = voltage.currents(log.time_s, log.current_a, slice(None))
@@ -262,9 +262,7 @@ def linearize(
     soc = plain.soc_pct[rows.at]
 
     def added_v(effect: Effect, values: Values, drop_v: FloatArray = load.drop_v) -> FloatArray:
-        at_load, context = load._replace(drop_v=drop_v), effect.context(values, voltage, pack)
-        drive = effect.voltage_drive(at_load, values, context)
-        return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage))
+        return effect.added_v(load._replace(drop_v=drop_v), rows.at, soc, values, model)
 
     features_at = features(soc, true.temperature_c[rows.at], plain.currents_a)
     residual_v = plain.residual_v

@@ -280,7 +280,7 @@ class Identification:
             "voltage error held out, MAE": held_out,
             "SoC from voltage, MAE": number(self.soc_newton_mae_pct, 2, "%"),
             "capacity": number(model.capacity_ah, 2, "Ah"),
-            "effects": ", ".join(str(effect["id"]) for effect in model.effects) or NONE_KNOWN,
+            "effects": ", ".join(effect["id"] for effect in model.effects) or NONE_KNOWN,
             "identified at SoC": span(*ranges.soc_pct, 1, "%"),
             "identified at temperature": span(*ranges.temperature_c, 1, "°C"),
             "rows used": str(sum(len(item.rows) for item in self.fits)),

@@ -176,22 +176,6 @@ class ExtendedModel:
             volts = volts + drive * effect.over_soc(soc_pct, values, self.model)
         return np.asarray(volts)
 
-    def added_v(self, load: Load, soc_pct: FloatArray) -> FloatArray:
-        """Return the sum of the effects' voltages from the first sample on [V], shape (n,).
-
-        Parameters
-        ----------
-        load : Load
-            Of n samples in order.
-        soc_pct : array of shape (n,)
-        """
-        volts = np.zeros_like(soc_pct)
-        for effect, values in self.effects:
-            drive = effect.drive(load, values, effect.context(values, self.model, self.pack))
-            if drive is not None:
-                volts += drive * effect.over_soc(soc_pct, values, self.model)
-        return volts
-
     def counting(self, initial_soc_pct: float) -> Counting:
         """Return how charge is counted from an assumed initial SoC [%]."""
         counting = Counting(self.capacity_ah, initial_soc_pct)

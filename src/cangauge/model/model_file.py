@@ -213,7 +213,7 @@ class Model(Fields):
     published: Published | None = None
     functions: FunctionFields
     noise: Noise
-    effects: list[dict[str, object]] = Field(default=[])
+    effects: list[dict[str, Any]] = Field(default=[])
     range: Ranges
     information: Information | None = None
     made: Made
@@ -237,7 +237,7 @@ class Model(Fields):
     def __repr__(self) -> str:
         """Return what the model is of and where it holds."""
         cells = f", {self.cells} cells" if self.cells else ""
-        effects = ", ".join(str(effect["id"]) for effect in self.effects) or "none"
+        effects = ", ".join(effect["id"] for effect in self.effects) or "none"
         error = number(self.noise.voltage_mae_pct, 2, "%")
         ranges = self.range
         lines = (

@@ -42,7 +42,7 @@ def middle(effect: Effect, pack: Pack = PACK) -> dict[str, float]:
         low, high = parameter.bounds(pack)
         if parameter.from_pack is not None:
             values |= effect.constants(pack)
-        elif parameter.neutral is None:
+        elif parameter in effect.shapes and effect.amplitudes:
             trials = parameter.trials(pack)
             values[parameter.name] = trials[len(trials) // 2]
         else:

@@ -49,9 +49,9 @@ def test_describes_itself(effect: Effect) -> None:
     assert len({parameter.name for parameter in effect.parameters}) == len(effect.parameters)
     for parameter in effect.parameters:
         assert parameter.low < parameter.high
-        assert parameter.neutral is None or parameter.low <= parameter.neutral <= parameter.high
-        assert parameter.neutral is not None or parameter.grid or parameter.from_pack
-        for value in parameter.grid or ():
+        is_amplitude = parameter in effect.amplitudes
+        assert not is_amplitude or parameter.low <= parameter.neutral <= parameter.high
+        for value in parameter.grid:
             assert parameter.low <= value <= parameter.high
     constants = effect.constants(PACK)
     named = {parameter.name for parameter in (*effect.amplitudes, *effect.shapes)}
@@ -65,10 +65,10 @@ def test_neutral_values_change_nothing(effect: Effect) -> None:
     rows = np.arange(0, signals.time_s.size, 3)
     plain = ExtendedModel(MODEL, CAPACITY_AH)
     expected = plain.predict(signals, 90.0, rows)
-    for shape in range(max(len(item.grid or ()) for item in effect.parameters) or 1):
+    for shape in range(max(len(item.grid) for item in effect.parameters) or 1):
         values = effect.neutral(PACK)
         for parameter in effect.parameters:
-            if parameter.grid and parameter.neutral is None:
+            if parameter.grid and effect.amplitudes:
                 trials = parameter.trials(PACK)
                 values[parameter.name] = trials[shape % len(trials)]
         extended = plain.with_effect(effect, values)

@@ -399,7 +399,7 @@ def _published_table(model: Published, condition_number: float) -> Table:
 def _effects(result: Identification) -> list[Block]:
     if result.effects is None:
         return []
-    ids = dict.fromkeys(str(entry["id"]) for entry in result.model.effects)
+    ids = dict.fromkeys(entry["id"] for entry in result.model.effects)
     note = "No effect is significant in these logs."
     if ids:
         note = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)

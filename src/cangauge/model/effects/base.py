@@ -24,13 +24,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.logs.log import Log
 from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel
+
+if TYPE_CHECKING:
+    from cangauge.model.extended import ExtendedModel
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
 
@@ -101,12 +105,12 @@ class Parameter:
     name, unit : str
     low, high : float
         Physical bounds, in units of `scale`.
-    neutral : float, optional
-        Value at which the effect does nothing, in units of `scale`; None for a shape without one.
+    neutral : float
+        Value of an amplitude at which the effect does nothing, in units of `scale`.
     scale : {"one", "capacity", "voltage", "resistance"}
         Pack size that converts bounds, neutral value and grid to `unit`.
     grid : tuple of floats, optional
-        Trial values of a shape; None for an amplitude.
+        Trial values of a shape, the usual one in the middle; () for an amplitude.
     from_pack : {"temperature_c"}, optional
         Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
     healthy_std : float
@@ -117,9 +121,9 @@ class Parameter:
     unit: str
     low: float
     high: float
-    neutral: float | None = 0.0
+    neutral: float = 0.0
     scale: Scale = "one"
-    grid: tuple[float, ...] | None = None
+    grid: tuple[float, ...] = ()
     from_pack: Literal["temperature_c"] | None = None
     healthy_std: float = 0.0
 
@@ -147,10 +151,10 @@ class Parameter:
     def trials(self, pack: Pack) -> tuple[float, ...]:
         """Return the trial values of a shape in its unit; none for an amplitude."""
         factor = self.factor(pack)
-        return tuple(value * factor for value in self.grid or ())
+        return tuple(value * factor for value in self.grid)
 
 
-DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0))
+DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, grid=(1.0, 0.0))
 """Whether an effect scales the whole drop of the voltage model (1) or only that of the present
 current over the sum of the resistances (0): contacts and electrolyte respond at once, diffusion
 does not. Values in between mix both."""
@@ -350,12 +354,30 @@ class Effect:
         """Whether the added voltage depends on the SoC."""
         return self.over_soc is not at_every_soc
 
-    def voltage_drive(self, load: Load, values: Values, context: Context) -> FloatArray:
-        """Return `drive` of an effect that adds a voltage."""
-        drive = self.drive(load, values, context)
+    def added_v(
+        self,
+        load: Load,
+        rows: NDArray[np.intp] | slice,
+        soc_pct: FloatArray,
+        values: Values,
+        model: ExtendedModel,
+    ) -> FloatArray:
+        """Return the added voltage of a log at some rows [V], shape (m,).
+
+        Parameters
+        ----------
+        load : Load
+            Of the whole log.
+        rows : array of int, shape (m,), or slice
+        soc_pct : array of shape (m,)
+            SoC there [%].
+        values : dict of str to float
+        model : ExtendedModel
+        """
+        drive = self.drive(load, values, self.context(values, model.model, model.pack))
         if drive is None:
-            raise ValueError(f"{self.id} adds no voltage")
-        return drive
+            return np.zeros_like(soc_pct)
+        return np.asarray(drive[rows] * self.over_soc(soc_pct, values, model.model))
 
     def constants(self, pack: Pack) -> dict[str, float]:
         """Return the parameters that are taken from the pack when the effect is added to it."""
@@ -367,15 +389,11 @@ class Effect:
 
     def neutral(self, pack: Pack) -> dict[str, float]:
         """Return values at which the effect does nothing."""
-        values = self.constants(pack)
-        for item in self.parameters:
-            if item.from_pack is None:
-                trials = item.trials(pack)
-                neutral = item.neutral
-                values[item.name] = (
-                    trials[len(trials) // 2] if neutral is None else neutral * item.factor(pack)
-                )
-        return values
+        values = {item.name: item.neutral * item.factor(pack) for item in self.amplitudes}
+        for item in self.shapes:
+            trials = item.trials(pack)
+            values[item.name] = trials[len(trials) // 2]
+        return values | self.constants(pack)
 
     def clipped(self, values: Values, pack: Pack) -> dict[str, float]:
         """Return values with the amplitudes clipped to the bounds of a model file."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,19 +17,6 @@ from cangauge.model.effects.voltages import VOLTAGES
 
 LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in (*CORRECTIONS, *COUNTS, *VOLTAGES)}
 """Effect id → effect, in the order in which effects are applied."""
-
-LARGEST = 1e30
-"""Upper limit of any parameter in a model file, in any unit."""
-
-RETIRED = ("inner_temperature", "ocv_shape")
-"""Effects of earlier versions. A model file with one is refused."""
-
-RETIRED_PARAMETERS: Mapping[str, str] = {
-    "resistance_temperature": "lag_s",
-    "entropic_coefficient": "lag_s",
-    "slow_diffusion": "spread",
-}
-"""Effect → parameter of earlier versions. At 0 it changes nothing and is dropped."""
 
 STEP = 0.02
 """Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
@@ -62,34 +50,56 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
     Raises
     ------
     InputError
-        If an entry is malformed, of an earlier version, or repeated with the same shape. If a
-        parameter is missing, unknown, not a number or outside its physical bounds. Names the field.
+        If an entry is malformed, unknown, or repeated with the same shape. If a parameter is
+        missing, unknown, not a number or outside its physical bounds. Names the field.
     """
     parsed: list[tuple[Effect, Values]] = []
-    seen: set[tuple[object, ...]] = set()
     for number, entry in enumerate(entries):
         field = f"effects.{number}"
-        if not isinstance(entry, Mapping) or set(entry) != {"id", "parameters"}:
-            raise InputError(
-                "an effect has the fields id and parameters only",
-                field=field,
-                value=sorted(map(str, entry)) if isinstance(entry, Mapping) else entry,
+        of = _fields(entry, ("id", "parameters"), "an effect", field)
+        effect = effect_of(of["id"], f"{field}.id")
+        names = [parameter.name for parameter in effect.parameters]
+        given = _fields(of["parameters"], names, effect.id, f"{field}.parameters")
+        values = {
+            parameter.name: _value(
+                parameter, given[parameter.name], pack, f"{field}.parameters.{parameter.name}"
             )
-        if entry["id"] in RETIRED:
-            raise InputError(
-                f"{entry['id']} is an effect of an earlier version",
-                field=f"{field}.id",
-                cure="fit again",
-            )
-        effect = effect_of(entry["id"], f"{field}.id")
-        values = _parse_values(effect, entry["parameters"], pack, f"{field}.parameters")
+            for parameter in effect.parameters
+        }
         # Two elements with different time constants form a chain; the same one twice is an error.
-        key = shape_key(effect, values)
-        if key in seen:
+        if shape_key(effect, values) in {shape_key(*other) for other in parsed}:
             raise InputError("given twice", field=f"{field}.id", value=effect.id)
-        seen.add(key)
         parsed.append((effect, values))
     return parsed
+
+
+def _fields(given: object, names: Sequence[str], owner: str, field: str) -> Mapping[str, Any]:
+    """Return a mapping of exactly some names; raise InputError for anything else."""
+    if isinstance(given, Mapping) and set(given) == set(names):
+        return given
+    raise InputError(
+        f"{owner} has the fields {', '.join(names)} only",
+        field=field,
+        value=sorted(map(str, given)) if isinstance(given, Mapping) else given,
+        cure="fit again",
+    )
+
+
+def _value(parameter: Parameter, given: object, pack: Pack, field: str) -> float:
+    """Return a parameter of a model file; raise InputError if it is impossible for the pack."""
+    low, high = parameter.bounds(pack, BOUND_MARGIN)
+    rounding = 1e-9 * (high - low)
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise InputError("must be a number", field=field, value=given)
+    # Not a number, and an integer beyond any float, are outside too.
+    if not low - rounding <= given <= high + rounding:
+        raise InputError(
+            f"must lie within {low:.6g} … {high:.6g} {parameter.unit} for this pack",
+            field=field,
+            value=given,
+            cure="check the value, its unit and the model's capacity",
+        )
+    return float(given)
 
 
 def effect_entries(effects: Sequence[tuple[Effect, Values]]) -> list[dict[str, object]]:
@@ -107,53 +117,6 @@ def shape_key(effect: Effect, values: Values) -> tuple[object, ...]:
     """Return id, shapes and constants: equal for two effects that differ in amplitude only."""
     amplitudes = {parameter.name for parameter in effect.amplitudes}
     return (effect.id, *(values[p.name] for p in effect.parameters if p.name not in amplitudes))
-
-
-def _parse_values(effect: Effect, given: object, pack: Pack, field: str) -> Values:
-    names = [parameter.name for parameter in effect.parameters]
-    retired = RETIRED_PARAMETERS.get(effect.id)
-    if isinstance(given, Mapping) and retired in given:
-        value = given[retired]
-        if isinstance(value, bool) or value != 0.0:
-            raise InputError(
-                "a parameter of an earlier version, which must be 0",
-                field=f"{field}.{retired}",
-                value=value,
-                cure="fit again",
-            )
-        given = {name: each for name, each in given.items() if name != retired}
-    if not isinstance(given, Mapping) or set(given) != set(names):
-        raise InputError(
-            f"{effect.id} has the parameters {', '.join(names)}",
-            field=field,
-            value=sorted(map(str, given)) if isinstance(given, Mapping) else given,
-        )
-    return {
-        parameter.name: _parse_value(
-            parameter, given[parameter.name], pack, f"{field}.{parameter.name}"
-        )
-        for parameter in effect.parameters
-    }
-
-
-def _parse_value(parameter: Parameter, given: object, pack: Pack, field: str) -> float:
-    # JSON integers have any length; only those of up to 308 digits convert to a float.
-    if (
-        isinstance(given, bool)
-        or not isinstance(given, int | float)
-        or not -LARGEST <= given <= LARGEST
-    ):
-        raise InputError("must be a finite number", field=field, value=given)
-    low, high = parameter.bounds(pack, BOUND_MARGIN)
-    rounding = 1e-9 * (high - low)
-    if not low - rounding <= given <= high + rounding:
-        raise InputError(
-            f"must lie within {low:.6g} … {high:.6g} {parameter.unit} for this pack",
-            field=field,
-            value=given,
-            cure="check the value, its unit and the model's capacity",
-        )
-    return float(given)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel, inverse_k
 REFERENCE_C: Final = 25.0
 """Temperature at which Arrhenius factors are 1 [°C]."""
 
-ACTIVATION: Final = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0, 3000.0))
+ACTIVATION: Final = Parameter("activation_k", "K", 0.0, 6000.0, grid=(0.0, 3000.0))
 """Arrhenius activation of an RC element's resistance, which is stated at 25 °C."""
 
 MEAN_SLOPE_PCT: Final = (10.0, 90.0)
@@ -232,11 +232,9 @@ VOLTAGES: Final = (
         fault="resistance",
         parameters=(
             Parameter("share", "1", 0.0, 3.0),
-            Parameter(
-                "activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)
-            ),
+            Parameter("activation_k", "K", 100.0, 8000.0, grid=(1000.0, 2500.0, 4500.0)),
             DELAYED,
-            Parameter("reference_c", "°C", *PLAUSIBLE_C, neutral=None, from_pack="temperature_c"),
+            Parameter("reference_c", "°C", *PLAUSIBLE_C, from_pack="temperature_c"),
         ),
         signature="the drop over the resistance, growing with (T₀ − T)",
         equation=(
@@ -259,7 +257,7 @@ VOLTAGES: Final = (
         parameters=(
             Parameter("at_empty", "1", -0.4, 3.0),
             Parameter("at_full", "1", -0.4, 1.5),
-            Parameter("width_pct", "%", 3.0, 60.0, neutral=None, grid=(5.0, 10.0, 20.0, 40.0)),
+            Parameter("width_pct", "%", 3.0, 60.0, grid=(5.0, 10.0, 20.0, 40.0)),
             DELAYED,
         ),
         signature="I·f(S): the drop over the resistance, larger near empty",
@@ -301,7 +299,7 @@ VOLTAGES: Final = (
         fault="resistance",
         parameters=(
             Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
-            Parameter("start_s", "s", 0.0, 1e7, neutral=None, grid=(1800.0,)),
+            Parameter("start_s", "s", 0.0, 1e7, grid=(1800.0,)),
         ),
         signature="I·1(t > t₀): the drop over the resistance changes in a step and stays changed",
         equation="ΔU = −r·I for t − t_first ≥ t₀, else 0",
@@ -326,12 +324,11 @@ VOLTAGES: Final = (
                 "A",
                 0.01,
                 2.0,
-                neutral=None,
                 scale="capacity",
                 grid=(0.02, 0.05, 0.12, 0.3, 0.8),
             ),
-            Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0)),
-            Parameter("activation_k", "K", 0.0, 10000.0, neutral=None, grid=(ACTIVATION_K,)),
+            Parameter("bend_only", "1", 0.0, 1.0, grid=(1.0, 0.0)),
+            Parameter("activation_k", "K", 0.0, 10000.0, grid=(ACTIVATION_K,)),
         ),
         signature="I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones",
         equation=(
@@ -351,7 +348,7 @@ VOLTAGES: Final = (
         fault="resistance",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
-            Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
+            Parameter("tau_s", "s", 0.3, 9.0, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
             ACTIVATION,
         ),
         signature="a tail of seconds after every change of load",
@@ -377,11 +374,10 @@ VOLTAGES: Final = (
                 "s",
                 70.0,
                 2500.0,
-                neutral=None,
                 grid=(80.0, 130.0, 220.0, 400.0, 750.0, 1400.0, 2400.0),
             ),
             ACTIVATION,
-            Parameter("by_slope", "1", 0.0, 1.0, neutral=None, grid=(0.0,)),
+            Parameter("by_slope", "1", 0.0, 1.0, grid=(0.0,)),
         ),
         signature="low-passed current over 70–2500 s: it decays through a rest after a drive",
         equation=(
@@ -406,7 +402,7 @@ VOLTAGES: Final = (
         fault="slow_voltage",
         parameters=(
             Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
-            Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
+            Parameter("travel_pct", "%", 0.5, 12.0, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
         ),
         signature=(
             "memory of sign(I) over Ah: reverses with lasting charge or discharge, persists at rest"
@@ -453,7 +449,6 @@ VOLTAGES: Final = (
                 "%",
                 2.0,
                 65.0,
-                neutral=None,
                 grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),
             ),
         ),
