@@ -92,7 +92,7 @@ def step_through(
         for reading in online.correct(Reading(*row)):
             counter.step(reading.time_s, online.counted(reading.current_a))
             online.advance(reading.time_s, reading.current_a, reading.temperature_c)
-            counted = start - counter.state.discharged_pct
+            counted = start - counter.discharged_pct
             asked = counted if asked_soc_pct is None else float(asked_soc_pct[len(readings)])
             readings.append(reading)
             soc.append(counted)
