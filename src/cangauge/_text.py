@@ -91,10 +91,13 @@ def counted(count: int, noun: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time span in seconds, minutes or hours."""
+    """Return a time span in seconds, minutes, hours or days."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.2f} h"
+    if seconds < 7200.0:
+        return f"{seconds / 60.0:.1f} min"
+    hours = seconds / 3600.0
+    return f"{hours:.2f} h" if hours < 100.0 else f"{hours / 24.0:.1f} days"
 
 
 _NUMBER: Final = re.compile(r"[−+-]?[\d.,]+([eE][+−-]?\d+)?( ?[%Ω])?|–|")

@@ -90,7 +90,7 @@ class InputError(CangaugeError):
         )
 
 
-_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?=['\d]))?")
+_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)(?: (from-soc)|( (?=['\d])))?")
 _ARGUMENTS: Final = {
     "temperature": "temperature_c",
     "initial-soc": "initial_soc_pct",
@@ -109,7 +109,9 @@ def naming_arguments(function: Callable[P, T]) -> Callable[P, T]:
     def named(text: str | None) -> str | None:
         def argument(match: re.Match[str]) -> str:
             name = _ARGUMENTS.get(match[1], match[1].replace("-", "_"))
-            return f"{name}=" if match[2] else name
+            if match[2]:
+                return f'{name}="{match[2]}"'
+            return f"{name}=" if match[3] else name
 
         return None if text is None else _OPTION.sub(argument, text)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import rounded
+from cangauge._text import duration, rounded
 from cangauge.cli.options import (
     JSON,
     REPORT,
@@ -112,7 +112,7 @@ def _show_log(found: LogInspection) -> None:
         rate = exact if timing.regular else f"about {rounded(timing.rate_hz, 2)} Hz (irregular)"
     say(f"{found.name}: {found.answer}.")
     say(
-        f"{found.rows} rows, {timing.duration_s / 60.0:.1f} min, {rate},"
+        f"{found.rows} rows, {duration(timing.duration_s)}, {rate},"
         f" temperature of: {found.temperature_source}"
     )
     print_table("Channels", *channel_rows(found))

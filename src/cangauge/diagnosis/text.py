@@ -164,7 +164,7 @@ def _to_do(found: Diagnosis) -> str:
         return f"{text} No correction: {found.why_not}."
     if found.correction_path:
         return f"{text} Corrected model: {found.correction_path}"
-    return f"{text} A corrected model is at hand (--extended MODEL)."
+    return f"{text} A corrected model is at hand (--extended MODEL, `extended_model()`)."
 
 
 def caveats(found: Diagnosis) -> list[str]:
