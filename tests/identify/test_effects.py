@@ -96,7 +96,7 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
     effect_ids = [effect_id for effect_id in LIBRARY if effect_id not in NOT_IDENTIFIABLE]
     chosen = offered(effect_ids, BASE)
     count = sum(len(item.amplitudes) for item in chosen)
-    linear = linearize(BASE, log, rows, Selected(tuple(chosen)), np.zeros(count))
+    linear = linearize(BASE, rows, Selected(tuple(chosen)), np.zeros(count))
     signals = Signals.of(log)
     start = log.first_soc()
     assert start is not None

@@ -312,10 +312,11 @@ class Estimator:
         memory.newton_pct = memory.newton_std_pct = math.nan
         memory.newton_inside = True
         if not math.isnan(sample.voltage_v):
-            newton = soc_from_ocv(online, sample.voltage_v - load_v, guess_pct)
+            ocv_v = sample.voltage_v - load_v
+            newton = soc_from_ocv(online.pseudo_ocv_at, ocv_v, guess_pct)
             memory.newton_pct, memory.newton_inside = newton
             memory.newton_std_pct = inverse_std_pct(
-                online, newton.soc_pct, self._temperature_c, load
+                online, memory.newton_pct, self._temperature_c, load
             )
             self._block.add(
                 Block(

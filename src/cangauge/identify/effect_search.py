@@ -31,7 +31,6 @@ from cangauge.identify.least_squares import (
     solve_without,
 )
 from cangauge.identify.rows import FitRows, dequantize, start_of
-from cangauge.logs.log import Log
 from cangauge.model.effects.base import Effect, Load, Signals, Values
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction
@@ -229,7 +228,7 @@ class Linearized:
 
 
 def linearize(
-    model: ExtendedModel, log: Log, rows: FitRows, selected: Selected, amplitudes: FloatArray
+    model: ExtendedModel, rows: FitRows, selected: Selected, amplitudes: FloatArray
 ) -> Linearized:
     """Return the model's prediction of a log and its derivatives on the rows of the fit.
 
@@ -237,13 +236,12 @@ def linearize(
     ----------
     model : ExtendedModel
         Without effects, or with the selected ones.
-    log : Log
     rows : FitRows
     selected : Selected
     amplitudes : array of shape (e,)
         Of the model's effects, relative to neutral; 0 without.
     """
-    voltage = model.model
+    voltage, log = model.model, rows.log
     row, start_pct = start_of(log)
     signals = Signals.of(dequantize(log))
     currents = voltage.currents(log.time_s, log.current_a, slice(None))
@@ -311,7 +309,8 @@ class Search:
     ----------
     model : ExtendedModel
         Fitted without effects.
-    logs, rows : sequences of Log and FitRows
+    rows : sequence of FitRows
+        Of each log.
     pack : PackPrior
     effect_ids : sequence of str
         Ids to add in their best shape, or `AUTO`.
@@ -320,7 +319,6 @@ class Search:
     def __init__(
         self,
         model: ExtendedModel,
-        logs: Sequence[Log],
         rows: Sequence[FitRows],
         pack: PackPrior,
         effect_ids: Sequence[str],
@@ -330,15 +328,15 @@ class Search:
         self._pack = pack
         self._offered = offered(SEARCHED if self._is_auto else effect_ids, model)
         chance = SIGNIFICANCE / max(len({item.effect.id for item in self._offered}), 1)
-        self._t_needed = float(stats.t.isf(chance, max(len(logs) - 1, 1)))
+        self._t_needed = float(stats.t.isf(chance, max(len(rows) - 1, 1)))
         every = Selected(tuple(self._offered))
         self._places = [part.tolist() for _, part in every.with_parts(np.arange(len(every.bounds)))]
         self.refused: list[EffectCandidate] = []
         """Candidates that are not offered any more."""
         self._sums: list[LogSums] = []
-        for number, (log, of_log) in enumerate(zip(logs, rows, strict=True), start=1):
-            _LOG.debug("columns of the effects: log %d of %d", number, len(logs))
-            linear = linearize(model, log, of_log, every, np.zeros(len(every.bounds)))
+        for number, of_log in enumerate(rows, start=1):
+            _LOG.debug("columns of the effects: log %d of %d", number, len(rows))
+            linear = linearize(model, of_log, every, np.zeros(len(every.bounds)))
             self._sums.append(log_sums(of_log, pack.chemistry, linear.table))
 
     def select(self) -> Selected:

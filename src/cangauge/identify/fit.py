@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -43,7 +43,7 @@ from cangauge.identify.published import (
     PublishedFit,
 )
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
-from cangauge.identify.starts import find_starts, given_starts, with_start
+from cangauge.identify.starts import find_starts, given_starts
 from cangauge.logs.charge import refuse_contradictions
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, as_log
@@ -155,43 +155,21 @@ def fit(
     unstated = [log for log, start in zip(recorded, stated_pct, strict=True) if start is None]
     refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
     effect_ids = _effect_ids(effects, equation)
-    stated = [
-        log if value is None else with_start(log, value)
-        for log, value in zip(recorded, stated_pct, strict=True)
-    ]
-    chemistry, remark = _chemistry_of(stated, chemistry, cells, capacity_ah)
+    chemistry, remark = _chemistry_of(recorded, stated_pct, chemistry, cells, capacity_ah)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
         pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
         starts = find_starts(recorded, stated_pct, pack)
         known = [start.log for start in starts]
-        knots = equation == "knots"
-        delays = DELAYS_S if knots else usable_delays(known, delay_s)
+        delays = DELAYS_S if equation == "knots" else usable_delays(known, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in known]
-        if (number := sum(map(len, rows))) < LEAST_ROWS:
-            raise InputError(
-                f"only {number} rows can be used, and a fit needs {LEAST_ROWS}",
-                source=recorded[0].source or recorded[0].name,
-                cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
-                " lists what a log can identify",
-            )
-        hashes = [log_sha256(log) for log in known]
-        listed = [
-            SourceLog(name=item.name, rows=len(item), sha256=digest)
-            for item, digest in zip(rows, hashes, strict=True)
-        ]
-        made = Made(
-            by=f"cangauge {__version__}",
-            options={
-                "capacity_ah": capacity_ah,
-                "rate_hz": rate_hz,
-                "chemistry": chemistry,
-                "equation": equation,
-                "initial_soc_pct": stated_pct[0] if len({*stated_pct}) == 1 else None,
-                "effects": ", ".join(effect_ids) or None,
-            },
-            logs=listed,
-            fingerprint=text_sha256("".join(hashes)),
-        )
+        options = {
+            "capacity_ah": capacity_ah,
+            "rate_hz": rate_hz,
+            "chemistry": chemistry,
+            "equation": equation,
+            "initial_soc_pct": stated_pct[0] if len({*stated_pct}) == 1 else None,
+            "effects": ", ".join(effect_ids) or None,
+        }
         fields: dict[str, Any] = {
             "name": common_name([log.name for log in recorded]),
             "chemistry": chemistry,
@@ -200,21 +178,19 @@ def fit(
             "rate_hz": rate_hz,
             "temperature_source": recorded[0].temperature_source,
             "range": ranges_of(rows),
-            "made": made,
+            "made": _made_of(rows, options),
         }
-        if knots:
-            fitted = _fit_knots(known, rows, pack, effect_ids, fields)
+        if equation == "knots":
+            fitted = _fit_knots(rows, pack, effect_ids, fields)
         else:
             fitted = _fit_published(rows, PublishedEquation(epsilon, t_ref_c, delays), fields)
         extended = fitted.model.extended_model()
-        fits = tuple(evaluate(extended, log, item) for log, item in zip(known, rows, strict=True))
+        fits = tuple(evaluate(extended, item) for item in rows)
     slope, expected = slope_resistances(fits, extended.model.loads.resistance_ohm)
     return Identification(
-        model=fitted.model,
+        **fitted._asdict(),
         starts=tuple(starts),
         fits=fits,
-        held_out_error_v=fitted.held_out_error_v,
-        published=fitted.published,
         energy=energy_balance(known, slope),
         slope_ohm=slope,
         slope_expected_ohm=expected,
@@ -223,7 +199,6 @@ def fit(
             *remarks_on_logs(rows, starts, recorded, delay_s, capacity_ah),
             *remarks_on_effects(fitted.effects, fitted.model),
         ),
-        effects=fitted.effects,
     )
 
 
@@ -268,8 +243,26 @@ def _effect_ids(effects: str | Sequence[str] | None, equation: Equation) -> tupl
     return ids
 
 
+def _made_of(rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
+    """Return how a model was made; raise InputError if the logs have too few rows for one."""
+    if (number := sum(map(len, rows))) < LEAST_ROWS:
+        raise InputError(
+            f"only {number} rows can be used, and a fit needs {LEAST_ROWS}",
+            source=rows[0].log.source or rows[0].name,
+            cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
+            " lists what a log can identify",
+        )
+    logs = [SourceLog(name=item.name, rows=len(item), sha256=log_sha256(item.log)) for item in rows]
+    fingerprint = text_sha256("".join(log.sha256 for log in logs))
+    return Made(by=f"cangauge {__version__}", options=options, logs=logs, fingerprint=fingerprint)
+
+
 def _chemistry_of(
-    logs: Sequence[Log], stated: ChemistryName | None, cells: int | None, capacity_ah: float
+    logs: Sequence[Log],
+    starts_pct: Sequence[float | None],
+    stated: ChemistryName | None,
+    cells: int | None,
+    capacity_ah: float,
 ) -> tuple[ChemistryName, str | None]:
     """Return the chemistry, stated or by the volts per cell, and a remark where it was not stated.
 
@@ -287,18 +280,18 @@ def _chemistry_of(
     rows = sum(map(len, logs))
     volts = sum(float(log.voltage_v.sum()) for log in logs) / rows / cells
     total_pct = 0.0
-    for log in logs:
+    for log, given_pct in zip(logs, starts_pct, strict=True):
         out_pct = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
         row, start_pct = log.first_soc() or (0, 50.0 + float(out_pct.mean()))
+        if given_pct is not None:
+            row, start_pct = 0, given_pct
         total_pct += float(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0).sum())
 
     def away(name: ChemistryName) -> float:
         kind = CHEMISTRIES[name]
-        typical = [
-            float(np.interp(total_pct / rows, KNOTS_PCT, curve_v))
-            for curve_v in (kind.curve_v, kind.other_v)
-        ]
-        return min(abs(volts / each - 1.0) for each in typical)
+        curves_v = np.array([kind.curve_v, kind.other_v])
+        typical = [np.interp(total_pct / rows, KNOTS_PCT, curve_v) for curve_v in curves_v]
+        return float(np.abs(volts / np.array(typical) - 1.0).min())
 
     name = min(CHEMISTRIES, key=away) if stated is None else stated
     if away(name) > CELLS_TOLERANCE:
@@ -344,7 +337,6 @@ class _Joint(NamedTuple):
 
 
 def _fit_knots(
-    logs: Sequence[Log],
     rows: Sequence[FitRows],
     pack: PackPrior,
     effect_ids: Sequence[str],
@@ -352,16 +344,16 @@ def _fit_knots(
 ) -> _Fitted:
     equation = PublishedEquation()
     published = equation.fit(rows, [equation.root(item) for item in rows])
-    if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
+    if usable_delays([item.log for item in rows], DELAYS_S) == DELAYS_S and published.identified:
         fields = fields | {"published": published.fields()}
     sums = [log_sums(item, pack.chemistry) for item in rows]
     joint = _Joint(*solve_scaled(sums, pack), rows)
     selected: Selected | None = None
     if effect_ids:
         plain = knots_file(joint.solution, fields).extended_model()
-        search = Search(plain, logs, rows, pack, effect_ids)
+        search = Search(plain, rows, pack, effect_ids)
         while (selected := search.select()).chosen:
-            with_effects = _with_effects(joint, selected, logs, pack, fields)
+            with_effects = _with_effects(joint, selected, pack, fields)
             at_bound = selected.at_bound(with_effects.solution)
             if not at_bound:
                 joint = with_effects
@@ -376,7 +368,6 @@ def _fit_knots(
 def _with_effects(
     plain: _Joint,
     selected: Selected,
-    logs: Sequence[Log],
     pack: PackPrior,
     fields: dict[str, Any],
 ) -> _Joint:
@@ -386,10 +377,7 @@ def _with_effects(
     amplitudes = np.zeros(std.size)
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
-        about = [
-            linearize(extended, log, item, selected, amplitudes)
-            for log, item in zip(logs, plain.rows, strict=True)
-        ]
+        about = [linearize(extended, item, selected, amplitudes) for item in plain.rows]
         volts = [
             item.features @ coefficients + item.columns @ amplitudes + item.residual_v
             for item in about
@@ -522,15 +510,15 @@ def _judged(
 def ranges_of(rows: Sequence[FitRows]) -> Ranges:
     """Return the ranges of SoC, temperature, current and voltage of some logs' rows."""
 
-    def span(values: Iterable[FloatArray]) -> tuple[float, float]:
-        ends = [(float(each.min()), float(each.max())) for each in values]
-        return min(low for low, _ in ends), max(high for _, high in ends)
+    def span(name: str) -> tuple[float, float]:
+        ends = [(values.min(), values.max()) for values in (getattr(each, name) for each in rows)]
+        return float(min(low for low, _ in ends)), float(max(high for _, high in ends))
 
     return Ranges(
-        soc_pct=span(item.soc_pct for item in rows),
-        temperature_c=span(item.temperature_c for item in rows),
-        current_a=span(item.log.current_a[item.at] for item in rows),
-        voltage_v=span(item.voltage_v for item in rows),
+        soc_pct=span("soc_pct"),
+        temperature_c=span("temperature_c"),
+        current_a=span("current_a"),
+        voltage_v=span("voltage_v"),
     )
 
 

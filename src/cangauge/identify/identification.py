@@ -123,13 +123,14 @@ class LogFit:
         return float(np.mean(np.abs(self.soc_newton_pct - self.rows.soc_pct)))
 
 
-def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
+def evaluate(model: ExtendedModel, rows: FitRows) -> LogFit:
     """Return the voltages and Newton inverse of a model on the rows of a log."""
     if not model.effects:
         columns = np.empty((3, len(rows)))
         for part in rows.parts():
             columns[:, part] = _predicted(model.model, rows.part(part))
         return LogFit(rows, *columns)
+    log = rows.log
     row, soc_pct = start_of(log)
     prediction = model.predict(Signals.of(log), soc_pct, rows.at, initial_row=row)
     temperature_c = prediction.signals.temperature_c[rows.at]

@@ -115,6 +115,11 @@ class FitRows:
         return self.log.voltage_v[self.at]
 
     @property
+    def current_a(self) -> FloatArray:
+        """Current; positive = discharge [A], shape (m,)."""
+        return self.log.current_a[self.at]
+
+    @property
     def temperature_c(self) -> FloatArray:
         """Temperature as reported: the input of an estimator [°C], shape (m,)."""
         return self.log.temperature_c[self.at]

@@ -5,7 +5,7 @@ The curve rises, so there is one root. A step that leaves the bracket is replace
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,41 +19,35 @@ STEPS_AT_MOST = 80
 """Bisection alone needs 37 steps from 100 % to the tolerance."""
 
 
-class Invertible(Protocol):
-    """A voltage over SoC: that of a voltage model, or of a model with effects at one sample."""
-
-    def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
-        """Return voltage [V] and its slope [V per %], positive, at one SoC [%]."""
-
-
-class Inverse(NamedTuple):
-    """A root of U(S) = U."""
-
-    soc_pct: float
-    """State of charge [%], within 0–100."""
-    inside: bool
-    """False if the voltage lies outside the model's range and the SoC was clipped."""
-
-
-def soc_from_ocv(model: Invertible, ocv_v: float, guess_pct: float = 50.0) -> Inverse:
+def soc_from_ocv(
+    ocv_at: Callable[[float], tuple[float, float]], ocv_v: float, guess_pct: float = 50.0
+) -> tuple[float, bool]:
     """Return the SoC at which the pseudo-OCV at reference temperature equals a voltage.
 
     Parameters
     ----------
-    model : VoltageModel or OnlineModel
+    ocv_at : callable
+        SoC [%] → pseudo-OCV [V] and its slope [V per %], positive.
     ocv_v : float
         Voltage [V] less the parts that do not depend on SoC (loads and temperature).
     guess_pct : float
         Start of the iteration [%]; the previous SoC saves steps.
+
+    Returns
+    -------
+    soc_pct : float
+        State of charge [%], within 0–100.
+    inside : bool
+        False if the voltage lies outside the model's range and the SoC was clipped.
     """
     low, high = 0.0, 100.0
     for end, is_beyond in ((low, ocv_v.__le__), (high, ocv_v.__ge__)):
-        end_v = model.pseudo_ocv_at(end)[0]
+        end_v = ocv_at(end)[0]
         if is_beyond(end_v):
-            return Inverse(end, inside=ocv_v == end_v)
+            return end, ocv_v == end_v
     soc = min(max(guess_pct, low), high)
     for _ in range(STEPS_AT_MOST):
-        volts, slope = model.pseudo_ocv_at(soc)
+        volts, slope = ocv_at(soc)
         error = volts - ocv_v
         if error > 0.0:
             high = soc
@@ -61,9 +55,9 @@ def soc_from_ocv(model: Invertible, ocv_v: float, guess_pct: float = 50.0) -> In
             low = soc
         following = soc - error / slope
         if abs(following - soc) < TOLERANCE_PCT:
-            return Inverse(min(max(following, 0.0), 100.0), inside=True)
+            return min(max(following, 0.0), 100.0), True
         soc = following if low < following < high else 0.5 * (low + high)
-    return Inverse(soc, inside=True)
+    return soc, True
 
 
 INVERSE_POINTS = 4001

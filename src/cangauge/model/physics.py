@@ -43,20 +43,20 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
             field="curve.voltage_v" if knots else prefix,
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-    numbers = range(len(model.loads.resistance_ohm))
-    names = [f"resistance_ohm.{k}" if knots else f"R{k + 1}" for k in numbers]
-    most_ohm = DROP_AT_1C * middle / capacity_ah
+    loads, most_ohm = model.loads, DROP_AT_1C * middle / capacity_ah
     limits = [
-        (f"{prefix}.{name}", ohm, most_ohm, "ohm")
-        for name, ohm in zip(names, model.loads.resistance_ohm, strict=True)
+        (
+            f"{prefix}.resistance_ohm.{k}" if knots else f"{prefix}.R{k + 1}",
+            ohm,
+            most_ohm,
+            "ohm",
+        )
+        for k, ohm in enumerate(loads.resistance_ohm)
     ]
     kt = f"{prefix}.{'kt_v_per_k' if knots else 'kt'}"
-    limits.append((kt, model.loads.kt_v_per_k, SLOPE_BY_TEMPERATURE * middle, "V/K"))
-    limits += [
-        ("noise.level_std_v", noise.level_std_v, middle, "V"),
-        ("noise.slow_std_v", noise.slow_std_v, middle, "V"),
-        ("noise.fast_std_v", noise.fast_std_v, middle, "V"),
-    ]
+    limits.append((kt, loads.kt_v_per_k, SLOPE_BY_TEMPERATURE * middle, "V/K"))
+    noises = ("level_std_v", "slow_std_v", "fast_std_v")
+    limits += [(f"noise.{name}", getattr(noise, name), middle, "V") for name in noises]
     for field, value, most, unit in limits:
         if abs(value) > most:
             raise InputError(
@@ -68,7 +68,7 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
             )
     # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
     # the spread of their resistances in the covariance, so that a wrong sign is within it.
-    (low_a, high_a), lasting_ohm = model.range.current_a, sum(model.loads.resistance_ohm)
+    (low_a, high_a), lasting_ohm = model.range.current_a, sum(loads.resistance_ohm)
     if not knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",

@@ -144,7 +144,7 @@ def test_newton_finds_a_root_with_all_effects(
     online = online_of(ExtendedModel(wide, 51.5, effects))
     online.advance(0.0, current, temperature)
     wanted = online.pseudo_ocv_at(soc)[0]
-    found = soc_from_ocv(online, wanted)
-    assert 0.0 <= found.soc_pct <= 100.0
-    if found.inside:
-        assert online.pseudo_ocv_at(found.soc_pct)[0] == pytest.approx(wanted, abs=1e-6)
+    found_pct, inside = soc_from_ocv(online.pseudo_ocv_at, wanted)
+    assert 0.0 <= found_pct <= 100.0
+    if inside:
+        assert online.pseudo_ocv_at(found_pct)[0] == pytest.approx(wanted, abs=1e-6)
