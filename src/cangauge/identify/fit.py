@@ -26,6 +26,7 @@ from cangauge.identify.identification import (
     evaluate,
     remarks_on_effects,
     remarks_on_logs,
+    remarks_on_rows,
     slope_resistances,
 )
 from cangauge.identify.least_squares import (
@@ -160,6 +161,7 @@ def fit(
         pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
         starts = find_starts(recorded, stated_pct, pack)
         known = [start.log for start in starts]
+        on_logs = remarks_on_logs(starts, recorded, delay_s, capacity_ah)  # before rows need memory
         delays = DELAYS_S if equation == "knots" else usable_delays(known, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in known]
         options = {
@@ -196,7 +198,8 @@ def fit(
         slope_expected_ohm=expected,
         remarks=(
             *([remark] if remark else []),
-            *remarks_on_logs(rows, starts, recorded, delay_s, capacity_ah),
+            *remarks_on_rows(rows),
+            *on_logs,
             *remarks_on_effects(fitted.effects, fitted.model),
         ),
     )

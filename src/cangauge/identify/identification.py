@@ -349,18 +349,17 @@ class Identification:
         }
 
 
-def remarks_on_logs(
-    rows: Sequence[FitRows],
-    starts: Sequence[Start],
-    recorded: Sequence[Log],
-    delay_s: Sequence[float],
-    capacity_ah: float,
-) -> list[str]:
-    """Return what is to be said about rows, gaps, starts and counted charge of the logs."""
-    found = []
+def remarks_on_rows(rows: Sequence[FitRows]) -> list[str]:
+    """Return what is to be said about the rows that a fit leaves out."""
     removed = sum(item.removed["start_up_or_shut_down"] for item in rows)
-    if removed:
-        found.append(f"{counted(removed, 'row')} of start-up and shut-down left out")
+    return [f"{counted(removed, 'row')} of start-up and shut-down left out"] if removed else []
+
+
+def remarks_on_logs(
+    starts: Sequence[Start], recorded: Sequence[Log], delay_s: Sequence[float], capacity_ah: float
+) -> list[str]:
+    """Return what is to be said about gaps, starts and counted charge of the logs."""
+    found = []
     usable = usable_delays(recorded, delay_s)
     if len(usable) < len(delay_s):
         left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
