@@ -163,6 +163,14 @@ class CoulombCounter:
             self.gap_var_pct2 += gap_pct * gap_pct
         return ChargeStep(seconds, out_pct)
 
+    def since(self, before: CoulombCounter) -> tuple[float, float, float]:
+        """Return time [s], charge taken out [%] and its variance [%²] since a copy was made."""
+        return (
+            self.counted_s - before.counted_s,
+            self.discharged_pct - before.discharged_pct,
+            self.gap_var_pct2 - before.gap_var_pct2,
+        )
+
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return the standard deviation of the charge since the last sample [%]."""
         if math.isnan(self.time_s):

@@ -135,6 +135,7 @@ class Estimator:
         self.hypotheses = Hypotheses(self.online)
         self._clock = EstimatorClock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
+        self._filter_at = self._coulomb_at = replace(self._counter)
         self._block = BlockState()
         self._memory = EstimatorMemory()
         self._power = PowerModel(self.online, self.settings.limits)
@@ -144,11 +145,8 @@ class Estimator:
         self._mismatch = temperature_mismatch(
             self.model.temperature_source, self.settings.temperature_source
         )
-        self._implausible = Reason.NONE
         self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
-        # Sample, stamp and reasons of an estimate that is not computed yet; None: it is computed.
-        self._pending: tuple[Sample, float, Reason] | None = None
         if self.settings.initial_soc_pct is not None:
             soc_pct = self.online.initial_soc_pct(self.settings.initial_soc_pct)
             self._start(soc_pct, self.settings.initial_soc_std_pct, is_doubtful=True)
@@ -161,10 +159,7 @@ class Estimator:
         return self.estimate
 
     def update(self, sample: Sample) -> None:
-        """Process one sample.
-
-        The estimate is computed on demand (`estimate`): a service receives thousands of samples
-        and publishes ten estimates a second. Reading it changes nothing.
+        """Process one sample; `estimate` is the one after it.
 
         A sample without a plausible current, or not later than the last one, is refused: the
         estimate stays the last one, marked `IMPLAUSIBLE_INPUT`. A clock that was set back is
@@ -182,7 +177,7 @@ class Estimator:
         if time_s is None:
             return
         memory, stamp_s = self._memory, sample.time_s
-        sample, self._implausible = drop_implausible(
+        sample, implausible = drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         if memory.samples == 0:
@@ -190,20 +185,18 @@ class Estimator:
         memory.samples += 1
         corrected = self.online.correct(Reading(*sample))
         for reading in corrected:
-            self._process(Sample(*reading))
+            self._process(Sample(*reading), implausible)
         if corrected:
-            self._pending = Sample(*corrected[-1]), stamp_s, self._implausible
-        else:
-            self._latest = self._evaluate()._replace(time_s=stamp_s, samples=memory.samples)
+            self._latest = self._evaluate(Sample(*corrected[-1]), implausible)
+        self._latest = self._latest._replace(time_s=stamp_s, samples=memory.samples)
 
     @property
     def estimate(self) -> Estimate:
         """The estimate after the latest sample; SoC and voltages are NaN until they are known."""
-        latest = self._evaluate()
         if not self.is_refused:
-            return latest
-        reasons = latest.reasons | Reason.IMPLAUSIBLE_INPUT
-        return latest._replace(reasons=reasons, status=status_of(reasons))
+            return self._latest
+        reasons = self._latest.reasons | Reason.IMPLAUSIBLE_INPUT
+        return self._latest._replace(reasons=reasons, status=status_of(reasons))
 
     @property
     def row(self) -> int:
@@ -260,7 +253,7 @@ class Estimator:
 
     # --- one sample
 
-    def _process(self, sample: Sample) -> None:
+    def _process(self, sample: Sample, implausible: Reason) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
         memory, block = self._memory, self._block
         time_s, current_a, voltage_v, temperature_c = sample
@@ -268,7 +261,7 @@ class Estimator:
         if number > block.number:
             self._close_block(time_s)
             block = self._block = BlockState(number)
-        if self._implausible and math.isnan(voltage_v):
+        if implausible and math.isnan(voltage_v):
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
             block.is_broken = True
         charge = self._counter.step(time_s, self.online.counted(current_a))
@@ -363,7 +356,9 @@ class Estimator:
         if block is None:
             return
         memory, hypotheses = self._memory, self.hypotheses
-        self._predict(block.counted_s, block.discharged_pct)
+        self._predict(
+            replace(self._counter, counted_s=block.counted_s, discharged_pct=block.discharged_pct)
+        )
         was_rejected = hypotheses.is_rejected
         hypotheses.update(block)
         if not hypotheses.is_valid():
@@ -394,21 +389,14 @@ class Estimator:
             memory.innovations = []
             self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
 
-    def _predict(self, counted_s: float, discharged_pct: float) -> None:
-        """Predict the filter to a count of time [s] and charge [%]."""
-        memory, gap_var_pct2 = self._memory, self._counter.gap_var_pct2
-        self.hypotheses.predict(
-            counted_s - memory.filter_counted_s,
-            discharged_pct - memory.filter_discharged_pct,
-            gap_var_pct2 - memory.filter_gap_var_pct2,
-        )
-        memory.filter_counted_s = counted_s
-        memory.filter_discharged_pct = discharged_pct
-        memory.filter_gap_var_pct2 = gap_var_pct2
+    def _predict(self, to: CoulombCounter) -> None:
+        """Predict the filter to a count."""
+        self.hypotheses.predict(*to.since(self._filter_at))
+        self._filter_at = to
 
     def _predict_to_now(self) -> None:
         """Predict the filter to the latest sample; the open block lies in part before it."""
-        self._predict(self._counter.counted_s, self._counter.discharged_pct)
+        self._predict(replace(self._counter))
         self._block.is_broken = True
 
     def _correct(self, reference: SocReference) -> None:
@@ -432,12 +420,9 @@ class Estimator:
         self._start_count(soc_pct, std_pct)
 
     def _start_count(self, soc_pct: float, std_pct: float) -> None:
-        memory, counter = self._memory, self._counter
-        memory.coulomb_start_pct = soc_pct + counter.discharged_pct
-        memory.coulomb_var_pct2 = std_pct**2
-        memory.coulomb_counted_s = counter.counted_s
-        memory.coulomb_moved_pct = counter.moved_pct
-        memory.coulomb_gap_var_pct2 = counter.gap_var_pct2
+        self._coulomb_at = replace(self._counter)
+        self._memory.coulomb_start_pct = soc_pct + self._counter.discharged_pct
+        self._memory.coulomb_var_pct2 = std_pct**2
 
     # --- the state after the latest sample
 
@@ -463,29 +448,22 @@ class Estimator:
 
     def _filter_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation of the filter, counted to the latest sample [%]."""
-        memory, counter = self._memory, self._counter
-        soc_pct, std_pct = self.hypotheses.soc_after(
-            counter.counted_s - memory.filter_counted_s,
-            counter.discharged_pct - memory.filter_discharged_pct,
-            counter.gap_var_pct2 - memory.filter_gap_var_pct2,
-        )
+        soc_pct, std_pct = self.hypotheses.soc_after(*self._counter.since(self._filter_at))
         return _clip(soc_pct), std_pct
 
     def _coulomb_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation by counting alone [%]; NaN until it has started."""
         memory, counter = self._memory, self._counter
+        seconds, _, gap_var_pct2 = counter.since(self._coulomb_at)
         std_pct = count_std_pct(
-            memory.coulomb_var_pct2 + counter.gap_var_pct2 - memory.coulomb_gap_var_pct2,
-            counter.counted_s - memory.coulomb_counted_s,
-            counter.moved_pct - memory.coulomb_moved_pct,
+            memory.coulomb_var_pct2 + gap_var_pct2,
+            seconds,
+            counter.moved_pct - self._coulomb_at.moved_pct,
         )
         return _clip(memory.coulomb_start_pct - counter.discharged_pct), std_pct
 
-    def _evaluate(self) -> Estimate:
-        """Return the estimate after the latest accepted sample."""
-        if self._pending is None:
-            return self._latest
-        (sample, stamp_s, implausible), self._pending = self._pending, None
+    def _evaluate(self, sample: Sample, implausible: Reason) -> Estimate:
+        """Return the estimate after a corrected sample."""
         memory, line, time_s = self._memory, self.online.delay_line, sample.time_s
         soc_pct, std_pct = self._soc()
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
@@ -505,8 +483,8 @@ class Estimator:
             if is_set:
                 bits |= int(reason)
         reasons = REASONS[bits | int(outside_model(self.voltage_model, soc_pct, sample))]
-        self._latest = Estimate(
-            stamp_s,
+        return Estimate(
+            time_s,
             soc_pct,
             std_pct,
             memory.newton_pct,
@@ -517,7 +495,6 @@ class Estimator:
             reasons,
             memory.samples,
         )
-        return self._latest
 
     # --- restart, and another model
 
@@ -602,17 +579,16 @@ class Estimator:
 
     def _follow(self, before: Estimator) -> None:
         """Take over from another estimator of this implementation."""
-        counter, latest = before._counter, before._evaluate()
+        latest = before._latest
         self._clock = replace(before._clock)
-        self._counter = replace(counter, capacity_ah=self.capacity_ah, gap_s=self.settings.gap_s)
+        settled = {"capacity_ah": self.capacity_ah, "gap_s": self.settings.gap_s}
+        self._counter = replace(before._counter, **settled)
+        self._filter_at = replace(self._counter)
         self._memory = memory = replace(before._memory, innovations=[])
         memory.mismatch_until_s = memory.coulomb_start_pct = math.nan
-        memory.filter_counted_s = counter.counted_s
-        memory.filter_discharged_pct = counter.discharged_pct
-        memory.filter_gap_var_pct2 = counter.gap_var_pct2
         memory.is_known = False
         self._block = BlockState(before._block.number, is_broken=True)
-        self._latest, self._pending, self.is_refused = latest, None, False
+        self._latest, self.is_refused = latest, False
         self.online.take_over(before.online)
         if not math.isnan(latest.soc_pct):
             self._start(latest.soc_pct, latest.soc_std_pct, is_doubtful=False)
@@ -625,13 +601,13 @@ class Estimator:
         clock = replace(self._clock, shift_s=self._clock.shift_s + stamp_shift_s)
         parts = {
             "clock": asdict(clock),
-            "counter": asdict(self._counter),
+            "counts": [asdict(self._counter), asdict(self._filter_at), asdict(self._coulomb_at)],
             "block": asdict(self._block),
             "memory": asdict(self._memory),
             "hypotheses": self.hypotheses.state(),
             "line": self.online.delay_line.contents,
             "online": self.online.state(),
-            "latest": self._evaluate(),
+            "latest": self._latest,
         }
         return json.dumps(parts).encode()
 
@@ -639,7 +615,9 @@ class Estimator:
         """Continue from the bytes of an equal estimator, of an age [s]."""
         parts = json.loads(packed)
         self._clock = EstimatorClock(**parts["clock"] | {"age_s": age_s})
-        self._counter = CoulombCounter(**parts["counter"] | {"gap_s": self.settings.gap_s})
+        counts = (CoulombCounter(**each) for each in parts["counts"])
+        self._counter, self._filter_at, self._coulomb_at = counts
+        self._counter.gap_s = self.settings.gap_s
         self._block = BlockState(**parts["block"])
         self._memory = EstimatorMemory(**parts["memory"])
         self.hypotheses.resume(**parts["hypotheses"])
@@ -647,7 +625,7 @@ class Estimator:
         self.online.restore(parts["online"])
         *numbers, status, reasons, samples = parts["latest"]
         self._latest = Estimate._make([*numbers, Status(status), Reason(reasons), samples])
-        self._pending, self.is_refused = None, False
+        self.is_refused = False
 
 
 def _clip(soc_pct: float) -> float:

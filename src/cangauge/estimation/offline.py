@@ -89,13 +89,8 @@ class EstimateTable(ArrowExport):
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> EstimateTable:
         """Collect estimates into columns."""
-        columns = list(zip(*estimates, strict=True)) or [()] * len(Estimate._fields)
-        by_name = dict(zip(Estimate._fields, columns, strict=True))
-        flags: dict[str, Any] = {
-            name: np.array(by_name[name], np.int64) for name in ("status", "reasons")
-        }
-        numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
-        return cls(**numbers, **flags)
+        columns = np.array([each[:9] for each in estimates], np.float64).reshape(-1, 9).T
+        return cls(*columns[:7], *columns[7:].astype(np.int64))
 
     def __repr__(self) -> str:
         """Return the number of samples, the time and the SoC at both ends."""

@@ -108,18 +108,10 @@ class EstimatorMemory:
     """Predicted voltage of the last row, and measured minus predicted [V]."""
     is_known: bool = False
     """Whether a start was given, or a block has been used."""
-    filter_discharged_pct: float = 0.0
-    filter_counted_s: float = 0.0
-    filter_gap_var_pct2: float = 0.0
-    """The counter's charge, time and gaps at the filter's state."""
     coulomb_start_pct: float = math.nan
     """SoC by counting, plus the charge counted so far [%]."""
     coulomb_var_pct2: float = math.nan
     """Variance of the SoC that counting started from [%²]."""
-    coulomb_counted_s: float = 0.0
-    coulomb_moved_pct: float = 0.0
-    coulomb_gap_var_pct2: float = 0.0
-    """The counter's time, moved charge and gaps when counting started."""
     gap_until_s: float = math.nan
     """End of the degradation by the last gap in the current [s]."""
     contradicted_until_s: float = math.nan
