@@ -458,17 +458,24 @@ static PyObject *Core_view(Core *self, PyObject *Py_UNUSED(none))
     const cg_ekf *ekf = cg_likelier(&state->filter, model);
     const int32_t size = cg_states(model);
     double low_passed[CG_LOW_PASSES];
+    double covariance[CG_STATES * CG_STATES];
+    const double *pair = ekf->p;
+    for (int32_t i = 0; i < size; ++i) {
+        for (int32_t j = 0; j <= i; ++j) {
+            covariance[(i * size) + j] = *pair;
+            covariance[(j * size) + i] = *pair++;
+        }
+    }
     for (int32_t k = 0; k < model->low_passes; ++k) {
         low_passed[k] = state->low_pass[k].value;
     }
     return Py_BuildValue(
-        "{s:y#,s:y#,s:y#,s:y#,s:y#,s:y#,s:y#,s:y#,s:d,s:d,s:d}",
-        "x", DOUBLES(ekf->x, size), "pairs", DOUBLES(ekf->p, size * (size + 1) / 2),
-        "b", DOUBLES(ekf->b, 2), "b_P", DOUBLES(ekf->b_p, 4), "b_V", DOUBLES(ekf->b_v, size * 2),
-        "load", DOUBLES(state->load, cg_loads(model)), "drives", DOUBLES(state->drive, model->effects),
-        "low_passed", DOUBLES(low_passed, model->low_passes),
-        "time_s", state->counter.time_s, "moved_pct", state->counter.moved_pct,
-        "temperature_c", state->memory.temperature_c);
+        "({s:y#,s:y#,s:y#,s:y#,s:y#},y#,y#,y#,d,d,d)",
+        "x", DOUBLES(ekf->x, size), "P", DOUBLES(covariance, size * size), "b", DOUBLES(ekf->b, 2),
+        "b_P", DOUBLES(ekf->b_p, 4), "b_V", DOUBLES(ekf->b_v, size * 2),
+        DOUBLES(state->load, cg_loads(model)), DOUBLES(state->drive, model->effects),
+        DOUBLES(low_passed, model->low_passes), state->counter.time_s, state->counter.moved_pct,
+        state->memory.temperature_c);
 }
 
 static PyMethodDef METHODS[] = {

@@ -13,7 +13,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import EstimatorSettings
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.power import KnownLimits
+from cangauge.estimation.power import PowerModel
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
@@ -111,11 +111,13 @@ def test_current_limits_hold_with_a_smaller_deviation() -> None:
 
 
 def test_limits_default_to_the_identified_range() -> None:
-    known = KnownLimits.of(PackLimits(), PACK)
-    assert known.min_voltage_v == PACK.pseudo_ocv_at(0.0)[0]
-    assert known.max_voltage_v == PACK.pseudo_ocv_at(100.0)[0]
+    known = PowerModel(leaf_2012_model_file().online(), PackLimits())
+    assert (known.min_v, known.max_v) == (
+        PACK.pseudo_ocv_at(0.0)[0],
+        PACK.pseudo_ocv_at(100.0)[0],
+    )
     assert (known.max_discharge_a, known.max_charge_a) == (200.0, 50.0)
-    assert known.cutoff_soc_pct == 0.0
+    assert known.cutoff_pct == 0.0
 
 
 @pytest.mark.parametrize(

@@ -98,11 +98,8 @@ class CellEstimator:
         self._due_s = -math.inf
         self._count = count
         self._first = first
-        self._distance = np.zeros(count)
-        self._resistance = np.zeros(count)
-        self._dd = np.full(count, CELL_SOC_STD_PCT**2)
-        self._dr = np.zeros(count)
-        self._rr = np.full(count, CELL_RESISTANCE_STD**2)
+        self._x = np.zeros((count, 2))  # d and r of each cell
+        self._P = np.tile(np.diag([CELL_SOC_STD_PCT**2, CELL_RESISTANCE_STD**2]), (count, 1, 1))
         self._is_seen = np.zeros(count, dtype=bool)
         self._last: PackTick | None = None
         self._sum_s = 0.0
@@ -149,7 +146,7 @@ class CellEstimator:
             return UNKNOWN._replace(
                 cells=known, sum_error_v=error_v, sum_std_v=std_v, is_sum_wrong=is_wrong
             )
-        distances = np.where(self._is_seen, self._distance, np.nan)
+        distances = np.where(self._is_seen, self._x[:, 0], np.nan)
         weakest = int(np.nanargmin(distances))
         soc_pct = self._last.soc_pct + float(distances[weakest])
         slope = float(self._model.pseudo_ocv_slope(soc_pct)[0])
@@ -158,7 +155,7 @@ class CellEstimator:
             weakest=self._first + weakest,
             soc_pct=min(max(soc_pct, 0.0), 100.0),
             soc_std_pct=math.sqrt(
-                float(self._dd[weakest])
+                float(self._P[weakest, 0, 0])
                 + (self._count * CELL_SENSOR_STD_V / slope) ** 2
                 + self._last.soc_std_pct**2
             ),
@@ -172,37 +169,30 @@ class CellEstimator:
     def soc_pct(self) -> FloatArray:
         """SoC of each cell [%], shape (n,); NaN where it was never seen."""
         soc_pct = math.nan if self._last is None else self._last.soc_pct
-        return np.where(self._is_seen, np.clip(soc_pct + self._distance, 0.0, 100.0), np.nan)
+        return np.where(self._is_seen, np.clip(soc_pct + self._x[:, 0], 0.0, 100.0), np.nan)
 
     def _predict(self, seconds: float, moved_pct: float) -> None:
-        self._dd += CELL_CAPACITY_STD**2 * CELL_SPAN_PCT * moved_pct
-        np.minimum(self._dd, 4.0 * CELL_SOC_STD_PCT**2, out=self._dd)
-        self._rr += CELL_RESISTANCE_STD**2 * seconds / 3600.0
-        np.minimum(self._rr, CELL_RESISTANCE_STD**2, out=self._rr)
+        dd, rr = self._P[:, 0, 0], self._P[:, 1, 1]
+        dd[:] = np.minimum(
+            dd + CELL_CAPACITY_STD**2 * CELL_SPAN_PCT * moved_pct, 4.0 * CELL_SOC_STD_PCT**2
+        )
+        rr[:] = np.minimum(rr + CELL_RESISTANCE_STD**2 * seconds / 3600.0, CELL_RESISTANCE_STD**2)
 
     def _fuse(self, tick: PackTick, volts: FloatArray, known: FloatArray) -> None:
-        soc_pct = np.clip(tick.soc_pct + self._distance, 0.0, 100.0)
-        expected = self._model.pseudo_ocv(soc_pct) + self._resistance * tick.drop_v
-        innovation = self._count * volts - tick.without_ocv_v - expected
-        if not self._is_seen.any():
-            # The first voltages: what cells differ in is not known yet.
-            common_v = float(np.median(innovation[known]))
-        else:
-            common_v = float(innovation[known].mean())
-        innovation = np.where(known, innovation - common_v, 0.0)
+        soc_pct = np.clip(tick.soc_pct + self._x[:, 0], 0.0, 100.0)
+        expected_v = self._model.pseudo_ocv(soc_pct) + self._x[:, 1] * tick.drop_v
+        y = self._count * volts - tick.without_ocv_v - expected_v
+        # Of the first voltages it is not known yet what cells differ in.
+        common = np.mean if self._is_seen.any() else np.median
+        y = np.where(known, y - common(y[known]), 0.0)
         self._is_seen |= known
         slope = self._model.pseudo_ocv_slope(soc_pct)
-        towards_d = self._dd * slope + self._dr * tick.drop_v
-        towards_r = self._dr * slope + self._rr * tick.drop_v
-        total = slope * towards_d + tick.drop_v * towards_r
-        total = total + (self._count * CELL_NOISE_STD_V) ** 2
-        gain_d = np.where(known, towards_d / total, 0.0)
-        gain_r = np.where(known, towards_r / total, 0.0)
-        self._distance = self._distance + gain_d * innovation
-        self._resistance = self._resistance + gain_r * innovation
-        self._dd = np.maximum(self._dd - gain_d * towards_d, 0.0)
-        self._dr = self._dr - gain_d * towards_r
-        self._rr = np.maximum(self._rr - gain_r * towards_r, 0.0)
+        H = np.stack((slope, np.full_like(slope, tick.drop_v)), axis=1)
+        PHt = np.einsum("nij,nj->ni", self._P, H)
+        S = np.sum(H * PHt, axis=1) + (self._count * CELL_NOISE_STD_V) ** 2
+        K = np.where(known, 1.0 / S, 0.0)[:, None] * PHt
+        self._x = self._x + K * y[:, None]
+        self._P = self._P - K[:, :, None] * PHt[:, None, :]
 
     def _check_sum(self, tick: PackTick, volts: FloatArray, seconds: float) -> None:
         difference_v = tick.voltage_v - float(volts.sum())

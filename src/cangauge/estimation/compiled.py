@@ -177,26 +177,16 @@ class CompiledEstimator(Estimator):
 
     def _refresh(self) -> None:
         """Show the reference what health, power and cells are computed from."""
-        view: dict[str, Any] = self.native.view()
-        view |= {name: np.frombuffer(each) for name, each in view.items() if type(each) is bytes}
-        n = view["x"].size
-        P = np.zeros((n, n))
-        P[np.tril_indices(n)] = view["pairs"]
-        P += np.tril(P, -1).T
-        learned = self.hypotheses.filters[0].resume(
-            x=view["x"],
-            P=P,
-            b=view["b"],
-            b_P=view["b_P"].reshape(2, 2),
-            b_V=view["b_V"].reshape(n, 2),
-        )
-        self.hypotheses.filters = [learned]
-        self._counter.time_s, self._counter.moved_pct = view["time_s"], view["moved_pct"]
-        self._memory.temperature_c = view["temperature_c"]
+        learned, *arrays, time_s, moved_pct, temperature_c = self.native.view()
+        load, drives, low_passed = map(np.frombuffer, arrays)
+        state: dict[str, Any] = {name: np.frombuffer(each) for name, each in learned.items()}
+        self.hypotheses.filters = [self.hypotheses.filters[0].resume(**state)]
+        self._counter.time_s, self._counter.moved_pct = time_s, moved_pct
+        self._memory.temperature_c = temperature_c
         # The reference has the drives of effects beside the SoC in one sum.
-        over, drives = self._is_over_soc, view["drives"]
-        by_reference = np.array([sum(drives[~over].tolist()), *drives[over].tolist()])
-        self.online.resume(view["load"], by_reference, view["low_passed"].tolist())
+        over = self._is_over_soc
+        drives = np.array([sum(drives[~over].tolist()), *drives[over].tolist()])
+        self.online.resume(load, drives, low_passed.tolist())
 
 
 def _of_effects(forms: list[CoreForm]) -> Constants:

@@ -290,9 +290,10 @@ class SocFilter:
         b_V: ArrayLike,
         evidence: float = 0.0,
     ) -> Self:
-        """Continue from a `state` of the same model; return self."""
-        self.x, self.P, self.evidence = np.array(x), np.array(P), evidence
-        self.bias.b, self.bias.P, self.bias.V = np.array(b), np.array(b_P), np.array(b_V)
+        """Continue from a `state` of the same model, its matrices flat or not; return self."""
+        self.x, self.P, self.evidence = np.array(x), np.reshape(P, self.P.shape), evidence
+        bias, self.bias.b = self.bias, np.array(b)
+        bias.P, bias.V = np.reshape(b_P, bias.P.shape), np.reshape(b_V, bias.V.shape)
         return self
 
     def take_over(self, before: SocFilter) -> None:

@@ -34,7 +34,7 @@ from cangauge.estimation.counting import (
 from cangauge.estimation.ekf import inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
-from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
+from cangauge.estimation.settings import EstimatorSettings, detect_references
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
 from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
@@ -243,10 +243,7 @@ class Estimator:
         if math.isnan(self._counter.time_s):
             return [math.nan] * len(stamps_s)
         at = self.online.delay_line.current_at
-        now_a = at(0.0)
-        # Cells of one frame share its stamp.
-        changes = {each: now_a - at(time_s - each) for each in {*stamps_s} if not math.isnan(each)}
-        return [changes.get(each, math.nan) for each in stamps_s]
+        return [math.nan if math.isnan(s) else at(0.0) - at(time_s - s) for s in stamps_s]
 
     def _refresh(self) -> None:
         """Bring the attributes to the latest sample, where the step is computed elsewhere."""
@@ -330,7 +327,7 @@ class Estimator:
             memory.voltage_model_v = online.pseudo_ocv_at(soc_pct)[0] + load_v
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in detect_references(self.settings, memory, sample):
-            self._correct(reference)
+            self._correct(*reference)
 
     def _watch_sign(self, sample: Sample) -> None:
         """Correlate the steps of voltage and current: of a battery they are opposite."""
@@ -399,19 +396,18 @@ class Estimator:
         self._predict(replace(self._counter))
         self._block.is_broken = True
 
-    def _correct(self, reference: SocReference) -> None:
+    def _correct(self, soc_pct: float, soc_std_pct: float) -> None:
         """Fuse an external SoC reference into count and filter, weighted by the variances."""
         self._predict_to_now()
-        self.hypotheses.correct(*reference)
+        self.hypotheses.correct(soc_pct, soc_std_pct)
         self._memory.is_known = True
-        soc_pct, std_pct = self._coulomb_soc()
-        if math.isnan(soc_pct):
-            self._start_count(*reference)
+        counted_pct, std_pct = self._coulomb_soc()
+        if math.isnan(counted_pct):
+            self._start_count(soc_pct, soc_std_pct)
             return
-        var_pct2 = std_pct**2
-        gain = var_pct2 / (var_pct2 + reference.soc_std_pct**2)
-        soc_pct += gain * (reference.soc_pct - soc_pct)
-        self._start_count(soc_pct, math.sqrt((1.0 - gain) * var_pct2))
+        gain = std_pct**2 / (std_pct**2 + soc_std_pct**2)
+        counted_pct += gain * (soc_pct - counted_pct)
+        self._start_count(counted_pct, math.sqrt((1.0 - gain) * std_pct**2))
 
     def _start(self, soc_pct: float, std_pct: float, *, is_doubtful: bool) -> None:
         """Start filter and count from a SoC and its standard deviation [%]."""

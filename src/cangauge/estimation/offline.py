@@ -299,31 +299,27 @@ def _run_columns(
 
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:
     """Compare estimates with the log that they were made from, over all rows that have both."""
-    residual = np.isfinite(table.residual_v)
     reference = np.full(len(log), np.nan)
     # A single finite SoC is the assumed start, not a reference.
     if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:
         reference = log.soc_pct
-
-    def absolute_error(values: FloatArray) -> FloatArray:
-        error = np.abs(values - reference)
-        return np.asarray(error[np.isfinite(error)])
-
-    def mean(values: FloatArray) -> float | None:
-        return float(values.mean()) if values.size else None
-
-    error = absolute_error(table.soc_pct)
-    std_pct = table.soc_std_pct[np.isfinite(table.soc_pct - reference)]
+    rows = np.isfinite(table.residual_v)
+    error = np.abs(table.soc_pct - reference)
+    inside = np.where(np.isfinite(error), error <= 2.0 * table.soc_std_pct, np.nan)
     return Scores(
         rows=len(log),
         seconds=seconds,
-        voltage_mae_pct=None
-        if not residual.any()
-        else 100.0 * float(np.mean(np.abs(table.residual_v[residual]) / log.voltage_v[residual])),
-        soc_mae_pct=mean(error),
-        soc_max_pct=float(error.max()) if error.size else None,
-        soc_newton_mae_pct=mean(absolute_error(table.soc_newton_pct)),
-        soc_coulomb_mae_pct=mean(absolute_error(table.soc_coulomb_pct)),
-        cover_2sigma=float(np.mean(error <= 2.0 * std_pct)) if error.size else None,
+        voltage_mae_pct=_mean(100.0 * np.abs(table.residual_v[rows]) / log.voltage_v[rows]),
+        soc_mae_pct=_mean(error),
+        soc_max_pct=_mean(error, np.max),
+        soc_newton_mae_pct=_mean(np.abs(table.soc_newton_pct - reference)),
+        soc_coulomb_mae_pct=_mean(np.abs(table.soc_coulomb_pct - reference)),
+        cover_2sigma=_mean(inside),
         valid_fraction=float(np.mean(table.status == Status.VALID)),
     )
+
+
+def _mean(values: FloatArray, of: Callable[[FloatArray], Any] = np.mean) -> float | None:
+    """Return the mean, or another number, of the known values; None without any."""
+    known = values[np.isfinite(values)]
+    return float(of(known)) if known.size else None

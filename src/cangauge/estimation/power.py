@@ -13,7 +13,7 @@ test of traction cells (IEC 62660-1), to a SoC or to the lowest voltage, whichev
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Self
+from typing import Final
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.ekf import FUNCTIONS, LEAST_SLOPE, LEVEL, SLOW, SocFilter
 from cangauge.estimation.health import health_of
 from cangauge.model.extended import OnlineModel
-from cangauge.model.voltage_model import HermiteCurve, VoltageModel
+from cangauge.model.voltage_model import HermiteCurve
 from cangauge.settings import PackLimits
 from cangauge.types import Health, Power
 
@@ -38,50 +38,11 @@ ENERGY_C_RATE: Final = 1.0 / 3.0
 ENERGY_STEPS: Final = 40
 """Steps of the discharge for the energy."""
 
-_ITERATIONS: Final = 6
-_CLOSE_A: Final = 1e-3
+ITERATIONS: Final = 6
+CLOSE_A: Final = 1e-3
+"""Steps of Newton's method, and the change of the current that ends them [A]."""
 
-
-class KnownLimits(NamedTuple):
-    """`PackLimits`, all known."""
-
-    min_voltage_v: float
-    max_voltage_v: float
-    max_discharge_a: float
-    max_charge_a: float
-    cutoff_soc_pct: float
-
-    @classmethod
-    def of(cls, stated: PackLimits, model: VoltageModel) -> Self:
-        """Return the stated limits, and those of the model where none are stated.
-
-        Raises
-        ------
-        InputError
-            If a stated voltage contradicts the model's other end.
-        """
-        ranges = model.range
-        low_pct, high_pct = ranges.soc_pct
-        low_a, high_a = ranges.current_a
-        low_v, high_v = model.pseudo_ocv_at(low_pct)[0], model.pseudo_ocv_at(high_pct)[0]
-        if ranges.voltage_v is not None:
-            low_v = min(low_v, ranges.voltage_v[0])
-            high_v = max(high_v, ranges.voltage_v[1])
-        known = cls(
-            _or(stated.min_voltage_v, low_v),
-            _or(stated.max_voltage_v, high_v),
-            _or(stated.max_discharge_a, max(high_a, 0.0)),
-            _or(stated.max_charge_a, max(-low_a, 0.0)),
-            _or(stated.cutoff_soc_pct, max(low_pct, 0.0)),
-        )
-        if known.min_voltage_v >= known.max_voltage_v:
-            raise InputError(
-                "the lowest voltage is not below the highest",
-                field="limits",
-                value=f"{known.min_voltage_v:.1f} … {known.max_voltage_v:.1f} V",
-                cure="state both min_voltage_v and max_voltage_v",
-            )
-        return known
+UNKNOWN: Final = (math.nan, math.nan)
 
 
 class PowerModel:
@@ -91,11 +52,37 @@ class PowerModel:
     ----------
     model : OnlineModel
     limits : PackLimits
+        Where none is stated, that of the model holds.
+
+    Attributes
+    ----------
+    min_v, max_v, max_discharge_a, max_charge_a, cutoff_pct : float
+        Limits [V, A, %].
+
+    Raises
+    ------
+    InputError
+        If a stated voltage contradicts the model's other end.
     """
 
     def __init__(self, model: OnlineModel, limits: PackLimits) -> None:
-        self.limits = KnownLimits.of(limits, model.model)
-        self._model = model
+        known, self._model = model.model.range, model
+        (low_pct, high_pct), (low_a, high_a) = known.soc_pct, known.current_a
+        low_v, high_v = known.voltage_v or (math.inf, -math.inf)
+        low_v = min(low_v, model.model.pseudo_ocv_at(low_pct)[0])
+        high_v = max(high_v, model.model.pseudo_ocv_at(high_pct)[0])
+        self.min_v = _or(limits.min_voltage_v, low_v)
+        self.max_v = _or(limits.max_voltage_v, high_v)
+        self.max_discharge_a = _or(limits.max_discharge_a, max(high_a, 0.0))
+        self.max_charge_a = _or(limits.max_charge_a, max(-low_a, 0.0))
+        self.cutoff_pct = _or(limits.cutoff_soc_pct, max(low_pct, 0.0))
+        if self.min_v >= self.max_v:
+            raise InputError(
+                "the lowest voltage is not below the highest",
+                field="limits",
+                value=f"{self.min_v:.1f} … {self.max_v:.1f} V",
+                cure="state both min_voltage_v and max_voltage_v",
+            )
 
     def at(
         self, filter_: SocFilter, soc_pct: float, soc_std_pct: float, temperature_c: float
@@ -112,62 +99,38 @@ class PowerModel:
         ahead = _Ahead(self._model, filter_, soc_pct, temperature_c)
         if 1.0 + ahead.resistance <= 0.0:  # learned of the wrong sign: not the pack's
             return Power()
-        limits = self.limits
         moments = [ahead.moment(HORIZON_S * step / STEPS) for step in range(1, STEPS + 1)]
-        out = [ahead.possible(limits.min_voltage_v, moment) for moment in moments]
-        into = [ahead.possible(limits.max_voltage_v, moment) for moment in moments]
-        discharge = min(filter(None, out), default=None)
-        charge = max(filter(None, into), default=None)
+        out = (ahead.possible(self.min_v, *moment) for moment in moments)
+        into = (ahead.possible(self.max_v, *moment) for moment in moments)
+        discharge_a, discharge_std_a = min(filter(None, out), default=UNKNOWN)
+        charge_a, charge_std_a = max(filter(None, into), default=UNKNOWN)
         return Power(
-            *_within(*ahead.with_std(discharge), limits.max_discharge_a),
-            *_within(*ahead.with_std(charge, sign=-1.0), limits.max_charge_a),
+            *_within(discharge_a, discharge_std_a, self.max_discharge_a),
+            *_within(-charge_a, charge_std_a, self.max_charge_a),
             *self._energy(ahead, soc_std_pct),
         )
 
     def _energy(self, ahead: _Ahead, soc_std_pct: float) -> tuple[float, float, float]:
         """Return the energy left, its standard deviation [Wh] and the SoC at which it ends [%]."""
-        health, limits = ahead.health, self.limits
-        end_pct = min(limits.cutoff_soc_pct, ahead.soc_pct)
-        soc_pct = np.linspace(ahead.soc_pct, end_pct, ENERGY_STEPS + 1)
-        step_pct = (ahead.soc_pct - end_pct) / ENERGY_STEPS
-        volts = ahead.lasting_v(soc_pct, ENERGY_C_RATE * health.capacity_ah)
-        low = np.flatnonzero(volts <= limits.min_voltage_v)
-        last = int(low[0]) if low.size else ENERGY_STEPS
-        # Part of each step above the lowest voltage: all of it, but for the last.
-        part, drop_v = np.ones(last), volts[:last] - volts[1 : last + 1]
-        unknown_pct, to_pct = 0.0, end_pct
-        if low.size:
+        capacity_ah = ahead.health.capacity_ah
+        to_pct = min(self.cutoff_pct, ahead.soc_pct)
+        soc_pct = np.linspace(ahead.soc_pct, to_pct, ENERGY_STEPS + 1)
+        volts = ahead.lasting_v(soc_pct, ENERGY_C_RATE * capacity_ah)
+        first_v, unknown_pct = float(volts[0]), 0.0
+        if np.any(volts <= self.min_v):
+            last = int(np.argmax(volts <= self.min_v))
             unknown_pct = ahead.std_v / ahead.slope_at(float(soc_pct[last]))
-            part[-1:] = (volts[last - 1] - limits.min_voltage_v) / drop_v[-1:]
-            to_pct = ahead.soc_pct - float(part.sum()) * step_pct
-        mean_v = volts[:last] - 0.5 * part * drop_v
-        energy_wh = float(mean_v @ part) * step_pct / 100.0 * health.capacity_ah
+            around = slice(max(last - 1, 0), last + 1)
+            to_pct = float(np.interp(self.min_v, volts[around][::-1], soc_pct[around][::-1]))
+            soc_pct = np.append(soc_pct[:last], to_pct)
+            volts = np.append(volts[:last], self.min_v)
+        mean_v = 0.5 * (volts[1:] + volts[:-1])
+        energy_wh = float(mean_v @ -np.diff(soc_pct)) / 100.0 * capacity_ah
         std_wh = math.hypot(
-            float(volts[0]) * math.hypot(soc_std_pct, unknown_pct) / 100.0 * health.capacity_ah,
-            energy_wh * health.capacity_std_ah / health.capacity_ah,
+            first_v * math.hypot(soc_std_pct, unknown_pct) / 100.0 * capacity_ah,
+            energy_wh * ahead.health.capacity_std_ah / capacity_ah,
         )
         return energy_wh, std_wh, to_pct
-
-
-class _Moment(NamedTuple):
-    """What a constant current from now on does to the voltage after a time."""
-
-    pct_per_a: float
-    """Charge that it takes [% per A]."""
-    base: FloatArray
-    """Load row without it, shape (k,)."""
-    per_a: FloatArray
-    """Change of the load row by it [1/A], shape (k,)."""
-    unknown_v: float
-    """Drop of currents that were not observed [V]."""
-
-
-class _Possible(NamedTuple):
-    """A current that meets a limit of the voltage; ordered by the current."""
-
-    current_a: float
-    volt_per_a: float
-    moment: _Moment
 
 
 class _Ahead:
@@ -198,59 +161,72 @@ class _Ahead:
         """Return the curve's slope [V per %], not less than the least."""
         return max(self._model.pseudo_ocv_at(soc_pct)[1], LEAST_SLOPE)
 
-    def moment(self, seconds: float) -> _Moment:
-        """Return the effect of a current after a time [s]."""
-        model = self._model
-        loads, line = model.model.loads, model.delay_line
+    def moment(self, seconds: float) -> tuple[float, FloatArray, FloatArray, float]:
+        """Return the effect of a constant current from now on after a time [s].
+
+        Returns
+        -------
+        float
+            Charge that it takes [% per A].
+        array of shape (k,)
+            Load row without it.
+        array of shape (k,)
+            Change of the load row by it [1/A].
+        float
+            Drop of currents that were not observed [V].
+        """
+        model, line = self._model, self._model.delay_line
+        loads, capacity_ah = model.model.loads, self.health.capacity_ah
         past, share, unknown_v = [], [], 0.0
         for delay_s, ohm in zip(loads.delays_s, loads.resistance_ohm, strict=False):
             is_ahead = delay_s <= seconds
             past.append(0.0 if is_ahead else line.current_at(delay_s - seconds))
             share.append(1.0 if is_ahead else 0.0)
             if delay_s - seconds > line.filled_s:
-                unknown_v += abs(ohm) * ENERGY_C_RATE * self.health.capacity_ah
+                unknown_v += abs(ohm) * ENERGY_C_RATE * capacity_ah
         for tau_s, lag in zip(loads.low_pass_s, model.lags, strict=True):
             keep = math.exp(-seconds / tau_s)
             past.append(keep * lag.value)
             share.append(1.0 - keep)
-        base = model.load_at(self._temperature_c, np.array(past))
-        ones = model.load_at(self._temperature_c, np.array(past) + np.array(share))
-        pct_per_a = seconds / (36.0 * self.health.capacity_ah)
-        return _Moment(pct_per_a, base, ones - base, unknown_v)
+        base = model.load_at(self._temperature_c, past)
+        ones = model.load_at(self._temperature_c, np.add(past, share))
+        return seconds / (36.0 * capacity_ah), base, ones - base, unknown_v
 
-    def possible(self, limit_v: float, moment: _Moment) -> _Possible | None:
-        """Return the current that meets a voltage at a moment.
+    def possible(
+        self,
+        limit_v: float,
+        pct_per_a: float,
+        base: FloatArray,
+        per_a: FloatArray,
+        unknown_v: float,
+    ) -> tuple[float, float] | None:
+        """Return the current that meets a voltage at a `moment`, and its standard deviation [A].
 
         None: the voltage rises with the current, so it is no limit.
         """
+        model = self._model
         learned_v = self._learned.at(self.soc_pct)[0]
-        fixed_v = self._fixed_v + learned_v + float(moment.base @ self._theta) - limit_v
-        ohm = float(moment.per_a @ self._theta)
+        fixed_v = self._fixed_v + learned_v + float(base @ self._theta) - limit_v
+        ohm = float(per_a @ self._theta)
         current_a = volt_per_a = 0.0
-        for _ in range(_ITERATIONS):
-            volts, slope = self._model.pseudo_ocv_at(self.soc_pct - moment.pct_per_a * current_a)
-            volt_per_a = slope * moment.pct_per_a - ohm
+        for _ in range(ITERATIONS):
+            volts, slope = model.pseudo_ocv_at(self.soc_pct - pct_per_a * current_a)
+            volt_per_a = slope * pct_per_a - ohm
             step_a = (volts + fixed_v + ohm * current_a) / volt_per_a
             current_a += step_a
-            if abs(step_a) < _CLOSE_A:
+            if abs(step_a) < CLOSE_A:
                 break
-        return _Possible(current_a, volt_per_a, moment) if volt_per_a > 0.0 else None
-
-    def with_std(self, found: _Possible | None, sign: float = 1.0) -> tuple[float, float]:
-        """Return a possible current times a sign and its standard deviation [A]; NaN for None."""
-        if found is None:
-            return math.nan, math.nan
-        current_a, volt_per_a, moment = found
-        model = self._model
-        load = moment.base + current_a * moment.per_a
-        after_pct = self.soc_pct - moment.pct_per_a * current_a
+        if volt_per_a <= 0.0:
+            return None
+        load = base + current_a * per_a
+        after_pct = self.soc_pct - pct_per_a * current_a
         slope = model.pseudo_ocv_at(after_pct)[1]
         drop_v = float(load[1:] @ model.load_coefficients[1:])
-        functions = model.functions.row(after_pct, load).tolist()
-        H = np.array([slope, 0.0, self._A, self._level_v, *functions, 0.0, drop_v])
+        functions = model.functions.row(after_pct, load)
+        H = np.r_[slope, 0.0, self._A, self._level_v, functions, 0.0, drop_v]
         residual_v = self._A * model.noise.residual_std_v
-        std_v = math.sqrt(H @ self._P @ H + residual_v**2 + moment.unknown_v**2)
-        return sign * current_a, std_v / volt_per_a
+        std_v = math.sqrt(H @ self._P @ H + residual_v**2 + unknown_v**2)
+        return current_a, std_v / volt_per_a
 
     def lasting_v(self, soc_pct: FloatArray, current_a: float) -> FloatArray:
         """Return the voltages [V] of a lasting current at SoC [%] of shape (n,)."""

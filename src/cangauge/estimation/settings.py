@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple, get_args
+from typing import get_args
 
 from cangauge.errors import require_choice
 from cangauge.estimation.state import EstimatorMemory
@@ -84,17 +84,12 @@ class EstimatorSettings:
         check_settings(self)
 
 
-class SocReference(NamedTuple):
-    """An external SoC reference and its standard deviation [%]."""
-
-    soc_pct: float
-    soc_std_pct: float
-
-
 def detect_references(
     settings: EstimatorSettings, memory: EstimatorMemory, sample: Sample
-) -> list[SocReference]:
-    """Return the references that a row establishes, once each time that a rule becomes true.
+) -> list[tuple[float, float]]:
+    """Return SoC and deviation [%] of the references that a row establishes.
+
+    A reference is given once each time that its rule becomes true.
 
     Parameters
     ----------
@@ -113,10 +108,10 @@ def detect_references(
             memory.full_since_s = sample.time_s
         was, memory.is_full = memory.is_full, sample.time_s - memory.full_since_s >= full.hold_s
         if memory.is_full and not was:
-            found.append(SocReference(full.soc_pct, full.soc_std_pct))
+            found.append((full.soc_pct, full.soc_std_pct))
     if rest is not None and not math.isnan(memory.newton_pct):
         was = memory.is_rested
         memory.is_rested = sample.time_s - memory.rest_since_s >= rest.after_s
         if memory.is_rested and not was:
-            found.append(SocReference(memory.newton_pct, rest.soc_std_pct))
+            found.append((memory.newton_pct, rest.soc_std_pct))
     return found

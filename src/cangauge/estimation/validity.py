@@ -18,14 +18,15 @@ def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
     `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
     """
     reason = _NO_REASON
-    low, high = VOLTAGE_WITHIN[0] * nominal_v, VOLTAGE_WITHIN[1] * nominal_v
-    if not math.isnan(sample.voltage_v) and not low <= sample.voltage_v <= high:
-        sample = sample._replace(voltage_v=math.nan)
-        reason = Reason.IMPLAUSIBLE_INPUT
-    low, high = TEMPERATURE_WITHIN_C
-    if not math.isnan(sample.temperature_c) and not low <= sample.temperature_c <= high:
-        sample = sample._replace(temperature_c=math.nan)
-        reason = Reason.IMPLAUSIBLE_INPUT
+    low, high = VOLTAGE_WITHIN
+    for name, least, most in (
+        ("voltage_v", low * nominal_v, high * nominal_v),
+        ("temperature_c", *TEMPERATURE_WITHIN_C),
+    ):
+        value = getattr(sample, name)
+        if value < least or value > most:  # false for NaN
+            sample = sample._replace(**{name: math.nan})
+            reason = Reason.IMPLAUSIBLE_INPUT
     return sample, reason
 
 
