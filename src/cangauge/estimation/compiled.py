@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from itertools import zip_longest
 from pathlib import Path
@@ -57,6 +57,9 @@ def _load(root: Path) -> Any:
         return None
     return core
 
+
+PROGRESS_EVERY: Final = 5000
+"""Samples between two calls of a progress callback."""
 
 _core: Final = _load(Path(__file__).parents[3])
 
@@ -124,13 +127,17 @@ class CompiledEstimator(Estimator):
         """Process one sample; see `Estimator.update`."""
         self.is_refused = not self.native.update(sample)
 
-    def run(self, columns: Sequence[FloatArray]) -> list[NDArray[Any]]:
+    def run(
+        self, columns: Sequence[FloatArray], progress: Callable[[int], None] | None = None
+    ) -> list[NDArray[Any]]:
         """Process whole columns; return those of the estimates.
 
         Parameters
         ----------
         columns : sequence of arrays of shape (n,)
             Time [s], current [A], voltage [V] and temperature [°C].
+        progress : callable, optional
+            Called with the number of samples done, every `PROGRESS_EVERY`.
 
         Returns
         -------
@@ -139,9 +146,12 @@ class CompiledEstimator(Estimator):
         """
         given = [np.ascontiguousarray(each, dtype=np.float64) for each in columns]
         rows = given[0].size
-        found: list[NDArray[Any]] = [np.empty(rows) for _ in range(7)]
-        found += [np.empty(rows, np.int64) for _ in range(2)]
-        self.native.run((*given, *found))
+        found = [*np.empty((7, rows)), *np.empty((2, rows), np.int64)]
+        for first in range(0, rows, PROGRESS_EVERY):
+            part = slice(first, first + PROGRESS_EVERY)
+            self.native.run(tuple(each[part] for each in (*given, *found)))
+            if progress is not None and first + PROGRESS_EVERY <= rows:
+                progress(first + PROGRESS_EVERY)
         return found
 
     @property

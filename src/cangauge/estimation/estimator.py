@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any, ClassVar, Final
 
+import numpy as np
 from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
@@ -337,14 +338,14 @@ class Estimator:
         if math.isnan(step_v) or abs(step_a) < STEP_C_RATE * self.capacity_ah:
             return
         keep = 1.0 - 1.0 / STEPS_MEMORY
-        memory.steps = keep * memory.steps + 1.0
-        memory.steps_v2 = keep * memory.steps_v2 + step_v * step_v
-        memory.steps_a2 = keep * memory.steps_a2 + step_a * step_a
-        memory.steps_va = keep * memory.steps_va + step_v * step_a
-        limit_va = STEPS_CORRELATION * math.sqrt(memory.steps_v2 * memory.steps_a2)
-        if memory.steps_va < 0.0:
+        step = 1.0, step_v * step_v, step_a * step_a, step_v * step_a
+        memory.steps = tuple(
+            keep * each + new for each, new in zip(memory.steps, step, strict=True)
+        )
+        weight, v2, a2, va = memory.steps
+        if va < 0.0:
             memory.is_sign_wrong = False
-        elif memory.steps >= STEPS_AT_LEAST and memory.steps_va > limit_va:
+        elif weight >= STEPS_AT_LEAST and va > STEPS_CORRELATION * math.sqrt(v2 * a2):
             memory.is_sign_wrong = True
 
     def _close_block(self, time_s: float) -> None:
@@ -598,14 +599,14 @@ class Estimator:
         parts = {
             "clock": asdict(clock),
             "counts": [asdict(self._counter), asdict(self._filter_at), asdict(self._coulomb_at)],
-            "block": asdict(self._block),
+            "block": vars(self._block),
             "memory": asdict(self._memory),
             "hypotheses": self.hypotheses.state(),
             "line": self.online.delay_line.contents,
             "online": self.online.state(),
             "latest": self._latest,
         }
-        return json.dumps(parts).encode()
+        return json.dumps(parts, default=np.ndarray.tolist).encode()
 
     def _unpack(self, packed: bytes, age_s: float) -> None:
         """Continue from the bytes of an equal estimator, of an age [s]."""
@@ -615,6 +616,9 @@ class Estimator:
         self._counter, self._filter_at, self._coulomb_at = counts
         self._counter.gap_s = self.settings.gap_s
         self._block = BlockState(**parts["block"])
+        if self._block.sums is not None:
+            *scalars, load, drives = self._block.sums
+            self._block.sums = Block._make([*scalars, np.array(load), np.array(drives)])
         self._memory = EstimatorMemory(**parts["memory"])
         self.hypotheses.resume(**parts["hypotheses"])
         self.online.delay_line.fill(*parts["line"])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cangauge._dataframes import ArrowExport
 from cangauge._extras import extra
 from cangauge._typing import FloatArray
-from cangauge.estimation.compiled import CompiledEstimator, make_estimator
+from cangauge.estimation.compiled import PROGRESS_EVERY, CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.gaps import usual_gap_s
@@ -23,9 +23,6 @@ from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.model_file import Model, as_model
 from cangauge.settings import GAP_S, VALID_STD_PCT, FullCharge, LongRest, Method
 from cangauge.types import Estimate, Sample, Status, reason_names
-
-PROGRESS_EVERY = 5000
-"""Samples between two calls of the progress callback."""
 
 LONGEST_GAP_S = 3600.0
 """Upper limit of a gap that follows from a slow log's step [s]."""
@@ -267,7 +264,10 @@ def step_all(
         Called with each sample after its step.
     """
     if isinstance(estimator, CompiledEstimator) and isinstance(samples, Log) and observe is None:
-        return _run_columns(estimator, samples, progress)
+        log = samples
+        columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+        found: list[Any] = estimator.run(columns, progress)
+        return EstimateTable(*found)
     estimates = []
     rows = samples_of(samples) if isinstance(samples, Log) else samples
     for done, sample in enumerate(rows, start=1):
@@ -280,21 +280,6 @@ def step_all(
         if progress is not None and done % PROGRESS_EVERY == 0:
             progress(done)
     return EstimateTable.of(estimates)
-
-
-def _run_columns(
-    estimator: CompiledEstimator, log: Log, progress: Callable[[int], None] | None
-) -> EstimateTable:
-    """Return the estimates of a log, in the compiled loop."""
-    parts = []
-    for first in range(0, len(log), PROGRESS_EVERY):
-        part = log.rows(slice(first, first + PROGRESS_EVERY))
-        columns = (part.time_s, part.current_a, part.voltage_v, part.temperature_c)
-        parts.append(estimator.run(columns))
-        if progress is not None and len(part) == PROGRESS_EVERY:
-            progress(first + PROGRESS_EVERY)
-    joined: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return EstimateTable(*joined)
 
 
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:

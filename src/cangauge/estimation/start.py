@@ -181,7 +181,7 @@ class Hypotheses:
         return all(each.is_valid() for each in self.filters)
 
     def state(self) -> dict[str, Any]:
-        """Return a copy of everything needed to continue, as plain numbers."""
+        """Return everything needed to continue."""
         filters = [each.state() for each in self.filters]
         odds = {"prior_log_odds": self.prior_log_odds, "decision": self.decision}
         return {"filters": filters, **odds}

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from operator import add
 from typing import Annotated, NamedTuple
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cangauge._typing import FloatArray
@@ -36,10 +36,6 @@ class Block(NamedTuple):
     """Drives of the model's effects."""
 
 
-SCALARS = len(Block._fields) - 2
-"""Fields of a block that are numbers; load row and drives follow."""
-
-
 @dataclass
 class BlockState:
     """The block that is being filled: sums over its rows.
@@ -54,27 +50,18 @@ class BlockState:
     rows: int = 0
     is_broken: bool = False
     """Whether a gap in the current lies in it."""
-    columns: int = 0
-    """Columns of the load row."""
-    sums: list[float] = field(default_factory=list)
-    """Of the fields of a `Block`, in their order."""
+    sums: Block | None = None
 
     def add(self, row: Block) -> None:
         """Add one row, given as a block of its own."""
-        values = (*row[:SCALARS], *row.load.tolist(), *row.drives.tolist())
-        sums = self.sums or [0.0] * len(values)
-        self.columns = row.load.size
-        self.sums = [a + b for a, b in zip(sums, values, strict=True)]
+        self.sums = row if self.sums is None else Block._make(map(add, self.sums, row))
         self.rows += 1
 
     def mean(self) -> Block | None:
         """Return the mean of the rows; None without rows, or with a gap among them."""
-        if self.is_broken or not self.rows:
+        if self.is_broken or self.sums is None:
             return None
-        numbers, load, drives = np.split(
-            np.array(self.sums) / self.rows, [SCALARS, SCALARS + self.columns]
-        )
-        return Block._make([*numbers.tolist(), load, drives])
+        return Block._make(each / self.rows for each in self.sums)
 
 
 @dataclass
@@ -92,10 +79,7 @@ class EstimatorMemory:
     row_v: float = math.nan
     row_a: float = 0.0
     """Voltage and current of the last row; NaN after a gap [V, A]."""
-    steps: float = 0.0
-    steps_v2: float = 0.0
-    steps_a2: float = 0.0
-    steps_va: float = 0.0
+    steps: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     """Weight of the latest steps of the current, and their sums [V², A², V·A]."""
     is_sign_wrong: bool = False
     newton_pct: float = math.nan
