@@ -21,7 +21,7 @@ from synthetic import synthetic_log
 HEATER_DROP = Effect(
     id="heater_drop",
     fault="voltage_reading",
-    parameters=(Parameter("drop_v", "V", -0.04, 0.04, scale="voltage"),),
+    parameters=(Parameter("drop_v", "V", -0.04, 0.04),),
     signature="a constant",
     equation="U = OCV − drop",
     source="an example",

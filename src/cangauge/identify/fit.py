@@ -186,11 +186,15 @@ def fit(
             fitted = _fit_knots(rows, pack, effect_ids, fields)
         else:
             fitted = _fit_published(rows, PublishedEquation(epsilon, t_ref_c, delays), fields)
-        extended = fitted.model.extended_model()
+        model, published, held_out_error_v, selected = fitted
+        extended = model.extended_model()
         fits = tuple(evaluate(extended, item) for item in rows)
     slope, expected = slope_resistances(fits, extended.model.loads.resistance_ohm)
     return Identification(
-        **fitted._asdict(),
+        model=model,
+        published=published,
+        held_out_error_v=held_out_error_v,
+        effects=selected,
         starts=tuple(starts),
         fits=fits,
         energy=energy_balance(known, slope),
@@ -200,7 +204,7 @@ def fit(
             *([remark] if remark else []),
             *remarks_on_rows(rows),
             *on_logs,
-            *remarks_on_effects(fitted.effects, fitted.model),
+            *remarks_on_effects(selected, model),
         ),
     )
 
@@ -308,11 +312,8 @@ def _chemistry_of(
     return name, None if stated else f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"
 
 
-class _Fitted(NamedTuple):
-    model: Model
-    published: PublishedFit
-    held_out_error_v: tuple[FloatArray, ...]
-    effects: Selected | None
+_Fitted = tuple[Model, PublishedFit, tuple[FloatArray, ...], Selected | None]
+"""Model, published equation, errors of left-out logs, and effects if any were asked for."""
 
 
 class _Joint(NamedTuple):
@@ -365,7 +366,7 @@ def _fit_knots(
     errors_v = joint.held_out_v()
     fields = fields | {"effects": effect_entries(joint.effects)}
     model = knots_file(joint.solution, fields, errors_v, joint.rows)
-    return _Fitted(model, published, errors_v, selected)
+    return model, published, errors_v, selected
 
 
 def _with_effects(
@@ -465,7 +466,7 @@ def _fit_published(
         noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),
         **fields,
     )
-    return _Fitted(model, published, errors, None)
+    return model, published, errors, None
 
 
 def _held_out(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[FloatArray, ...]:

@@ -144,10 +144,9 @@ def evaluate(model: ExtendedModel, rows: FitRows) -> LogFit:
 
 def _predicted(model: VoltageModel, rows: FitRows) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return pseudo-OCV and voltage [V], and the Newton inverse [%], without effects."""
-    currents_a = rows.currents_a[
-        :, : len(model.loads.resistance_ohm)
-    ]  # the published one: delayed only
-    load_v = model.load_columns(rows.temperature_c, currents_a) @ model.load_coefficients
+    currents = len(model.loads.resistance_ohm)  # the published equation has delayed ones only
+    columns = model.load_columns(rows.temperature_c, rows.currents_a[:, :currents])
+    load_v = columns @ model.load_coefficients
     voltage_v = model.pseudo_ocv(rows.soc_pct) + load_v
     newton_pct = socs_from_ocv(model, rows.voltage_v - load_v)
     return model.pseudo_ocv(rows.soc_pct, rows.temperature_c), voltage_v, newton_pct
@@ -233,8 +232,8 @@ class Identification:
         ends += [f"above {high:.0f} %"] if high < 100.0 - NEAR_AN_END_PCT else []
         if ends:
             text += f" Add a drive {' and '.join(ends)}: there the curve {self.beyond}."
-        celsius = np.concatenate([item.rows.temperature_c for item in self.fits])
-        if (change_k := float(np.ptp(celsius))) < TEMPERATURE_SPAN_K:
+        least_c, most_c = self.model.range.temperature_c
+        if (change_k := most_c - least_c) < TEMPERATURE_SPAN_K:
             text += (
                 " No temperature dependence: the logs have one temperature, within"
                 f" {number(change_k, 1, 'K')}."

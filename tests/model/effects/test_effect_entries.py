@@ -38,7 +38,7 @@ def test_values_within_bounds_are_accepted(effect: Effect, part: float) -> None:
 def test_a_value_far_out_of_bounds_names_the_parameter(effect: Effect) -> None:
     for parameter in effect.parameters:
         low, high = parameter.bounds(PACK)
-        widths = 2.5 if parameter.scale == "one" else 1.2 * BOUND_MARGIN
+        widths = 1.2 * BOUND_MARGIN if parameter.is_relative else 2.5
         for wrong in (high + widths * (high - low), low - widths * (high - low)):
             values = middle(effect) | {parameter.name: wrong}
             with pytest.raises(InputError, match="must lie within") as error:

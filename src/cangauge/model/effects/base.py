@@ -36,8 +36,6 @@ from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel
 if TYPE_CHECKING:
     from cangauge.model.extended import ExtendedModel
 
-Scale = Literal["one", "capacity", "voltage", "resistance"]
-
 FaultName = Literal[
     "voltage_reading",
     "current_reading",
@@ -102,19 +100,20 @@ class Parameter:
 
     Parameters
     ----------
-    name, unit : str
+    name : str
+    unit : str
+        Bounds, neutral value, grid and `healthy_std` of a voltage, current or resistance are
+        relative to the pack's voltage, capacity or resistance.
     low, high : float
-        Physical bounds, in units of `scale`.
+        Physical bounds.
     neutral : float
-        Value of an amplitude at which the effect does nothing, in units of `scale`.
-    scale : {"one", "capacity", "voltage", "resistance"}
-        Pack size that converts bounds, neutral value and grid to `unit`.
+        Value of an amplitude at which the effect does nothing.
     grid : tuple of floats, optional
         Trial values of a shape, the usual one in the middle; () for an amplitude.
     from_pack : {"temperature_c"}, optional
         Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
     healthy_std : float
-        Standard deviation of an amplitude between logs of one healthy pack, in units of `scale`.
+        Standard deviation of an amplitude between logs of one healthy pack.
     """
 
     name: str
@@ -122,29 +121,29 @@ class Parameter:
     low: float
     high: float
     neutral: float = 0.0
-    scale: Scale = "one"
     grid: tuple[float, ...] = ()
     from_pack: Literal["temperature_c"] | None = None
     healthy_std: float = 0.0
 
+    @property
+    def is_relative(self) -> bool:
+        """Whether its bounds are relative to the pack."""
+        return self.unit in {"A", "V", "V/K", "ohm"}
+
     def factor(self, pack: Pack) -> float:
-        """Return the factor from units of `scale` to the parameter's unit."""
-        sizes = {
-            "one": 1.0,
-            "capacity": pack.capacity_ah,
-            "voltage": pack.voltage_v,
-            "resistance": pack.resistance_ohm,
-        }
-        return sizes[self.scale]
+        """Return what bounds and grid are relative to, in the parameter's unit."""
+        volts = pack.voltage_v
+        sizes = {"A": pack.capacity_ah, "V": volts, "V/K": volts, "ohm": pack.resistance_ohm}
+        return sizes.get(self.unit, 1.0)
 
     def bounds(self, pack: Pack, margin: float = 1.0) -> tuple[float, float]:
         """Return the physical bounds in the parameter's unit.
 
-        Bounds that scale with the pack are widened by the factor `margin` (`BOUND_MARGIN`).
+        Those relative to the pack are widened by the factor `margin` (`BOUND_MARGIN`).
         """
         factor = self.factor(pack)
         low, high = self.low * factor, self.high * factor
-        if self.scale != "one":
+        if self.is_relative:
             low, high = (low * margin if low < 0.0 else low / margin), high * margin
         return low, high
 

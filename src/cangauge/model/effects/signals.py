@@ -177,7 +177,7 @@ CORRECTIONS: Final = (
     Effect(
         id="current_offset",
         fault="current_reading",
-        parameters=(Parameter("offset_a", "A", -0.15, 0.15, scale="capacity", healthy_std=5e-4),),
+        parameters=(Parameter("offset_a", "A", -0.15, 0.15, healthy_std=5e-4),),
         signature="a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C",
         equation="I = I_measured − b",
         source="zero error, JCGM 200:2012 (VIM)",
@@ -206,7 +206,7 @@ CORRECTIONS: Final = (
     Effect(
         id="voltage_offset",
         fault="voltage_reading",
-        parameters=(Parameter("offset_v", "V", -0.04, 0.04, scale="voltage", healthy_std=2e-4),),
+        parameters=(Parameter("offset_v", "V", -0.04, 0.04, healthy_std=2e-4),),
         signature="a constant, at any current, SoC and temperature",
         equation="U = U_measured − b",
         source="zero error, JCGM 200:2012 (VIM)",

@@ -280,7 +280,7 @@ VOLTAGES: Final = (
     Effect(
         id="resistance_asymmetry",
         fault="resistance",
-        parameters=(Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),),
+        parameters=(Parameter("charging_ohm", "ohm", -0.6, 1.5),),
         signature="min(I, 0): only while charging, in step with the current",
         equation="ΔU = −r·min(I, 0)",
         source="Hu, Li, Peng, J. Power Sources 198 (2012) 359",
@@ -298,7 +298,7 @@ VOLTAGES: Final = (
         id="resistance_step",
         fault="resistance",
         parameters=(
-            Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
+            Parameter("step_ohm", "ohm", -0.4, 2.0),
             Parameter("start_s", "s", 0.0, 1e7, grid=(1800.0,)),
         ),
         signature="I·1(t > t₀): the drop over the resistance changes in a step and stays changed",
@@ -318,13 +318,12 @@ VOLTAGES: Final = (
         id="charge_transfer",
         fault="resistance",
         parameters=(
-            Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
+            Parameter("scale_v", "V", 0.0, 0.03),
             Parameter(
                 "exchange_a",
                 "A",
                 0.01,
                 2.0,
-                scale="capacity",
                 grid=(0.02, 0.05, 0.12, 0.3, 0.8),
             ),
             Parameter("bend_only", "1", 0.0, 1.0, grid=(1.0, 0.0)),
@@ -347,7 +346,7 @@ VOLTAGES: Final = (
         id="fast_polarization",
         fault="resistance",
         parameters=(
-            Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
+            Parameter("ohm", "ohm", 0.0, 1.0),
             Parameter("tau_s", "s", 0.3, 9.0, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
             ACTIVATION,
         ),
@@ -368,7 +367,7 @@ VOLTAGES: Final = (
         id="slow_diffusion",
         fault="slow_voltage",
         parameters=(
-            Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
+            Parameter("ohm", "ohm", 0.0, 1.5),
             Parameter(
                 "tau_s",
                 "s",
@@ -401,7 +400,7 @@ VOLTAGES: Final = (
         id="hysteresis",
         fault="slow_voltage",
         parameters=(
-            Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
+            Parameter("half_width_v", "V", 0.0, 0.01),
             Parameter("travel_pct", "%", 0.5, 12.0, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
         ),
         signature=(
@@ -422,9 +421,9 @@ VOLTAGES: Final = (
         id="entropic_coefficient",
         fault="temperature",
         parameters=(
-            Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
-            Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
-            Parameter("curve_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
+            Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4),
+            Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4),
+            Parameter("curve_v_per_k", "V/K", -1.1e-4, 1.1e-4),
         ),
         signature="(T − T_r)·f(S), at any current",
         equation="ΔU = (T − T_r)·(c + a·x + b·(3x² − 1)/2), x = S/50 − 1",
