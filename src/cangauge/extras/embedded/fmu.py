@@ -26,7 +26,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
-from xml.etree import ElementTree as ET
 
 from cangauge._files import atomic_path
 from cangauge._resources import shared_file
@@ -76,20 +75,42 @@ SENSORS: Final = ("current_sensor", "voltage_sensor", "time_skew", "temperature_
 """Kinds that change what is measured, not the pack."""
 LONGEST_NAME: Final = 60
 """Characters of a unit's name, a C identifier and the name of its binary."""
-UNITS: Final = {
-    "A": {"A": "1"},
-    "V": {"kg": "1", "m": "2", "s": "-3", "A": "-1"},
-    "degC": {"K": "1", "offset": "273.15"},
-    "%": {"factor": "0.01"},
-    "A.h": {"A": "1", "s": "1", "factor": "3600"},
-    "s": {"s": "1"},
-}
-"""Unit → its base units, in the attributes of FMI."""
-
-
 STEP_S: Final = 0.1
 """Step that a unit proposes [s], the period of a current sensor: the inputs of a step are those of
 its beginning, so that outputs are late by one step."""
+DESCRIPTION: Final = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="{name}" guid="{token}"
+    generationTool="cangauge {version}" variableNamingConvention="structured">
+  <CoSimulation modelIdentifier="{name}" canHandleVariableCommunicationStepSize="true"
+      canGetAndSetFMUstate="true">
+    <SourceFiles>
+{files}
+    </SourceFiles>
+  </CoSimulation>
+  <UnitDefinitions>
+    <Unit name="A"><BaseUnit A="1"/></Unit>
+    <Unit name="V"><BaseUnit kg="1" m="2" s="-3" A="-1"/></Unit>
+    <Unit name="degC"><BaseUnit K="1" offset="273.15"/></Unit>
+    <Unit name="%"><BaseUnit factor="0.01"/></Unit>
+    <Unit name="A.h"><BaseUnit A="1" s="1" factor="3600"/></Unit>
+    <Unit name="s"><BaseUnit s="1"/></Unit>
+  </UnitDefinitions>
+  <DefaultExperiment startTime="0" stepSize="{step_s}"/>
+  <ModelVariables>
+{variables}
+  </ModelVariables>
+  <ModelStructure>
+    <Outputs>
+{unknowns}
+    </Outputs>
+    <InitialUnknowns>
+{unknowns}
+    </InitialUnknowns>
+  </ModelStructure>
+</fmiModelDescription>
+"""
+"""modelDescription.xml of FMI 2.0."""
 FINITE: Final = (-sys.float_info.max, sys.float_info.max)
 AMPERE_HOURS: Final = (1e-3, 1e5)
 """Capacities that the commands take too [A h]."""
@@ -109,13 +130,37 @@ class Variable:
     """A variable of a unit; its value reference is its place."""
 
     name: str
-    causality: Literal["independent", "input", "output", "parameter", "local"]
+    causality: Literal["independent", "input", "output", "parameter"]
     unit: str | None
     start: float | None
     description: str
     is_integer: bool = False
     range: tuple[float, float] | None = None
     """Lowest and highest value that can be set; None: any, NaN too."""
+
+    def xml(self, reference: int) -> str:
+        """Return the variable's element of the description."""
+        variability, initial = "discrete" if self.is_integer else "continuous", ""
+        if self.causality == "parameter":
+            variability, initial = "fixed", ' initial="exact"'
+        elif self.causality == "output":
+            initial = ' initial="calculated"'
+        low, high = self.range or FINITE
+        values = {
+            "min": None if low == FINITE[0] else low,
+            "max": None if high == FINITE[1] else high,
+            "start": self.start,
+            "unit": self.unit,
+        }
+        stated = "".join(
+            f' {name}="{value}"' for name, value in values.items() if value is not None
+        )
+        return (
+            f'    <ScalarVariable name="{self.name}" valueReference="{reference}"'
+            f' causality="{self.causality}" variability="{variability}"{initial}'
+            f' description="{self.description}">'
+            f"<{'Integer' if self.is_integer else 'Real'}{stated}/></ScalarVariable>"
+        )
 
 
 def export_fmu(model: Model, path: Path, *, kind: Kind = "pack") -> Path:
@@ -140,7 +185,7 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack") -> Path:
         root = Path(folder)
         unit.write_sources(root / "sources")
         unit.compile(root)
-        (root / "modelDescription.xml").write_bytes(unit.description())
+        (root / "modelDescription.xml").write_text(unit.description(), encoding="utf-8")
         with atomic_path(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
             for file in sorted(root.rglob("*")):
                 if file.is_file():
@@ -234,52 +279,29 @@ class _Unit:
         if done.returncode != 0:
             raise CangaugeError(f"the C compiler failed: {done.stderr.strip()[-400:]}")
 
-    def description(self) -> bytes:
+    def description(self) -> str:
         """Return modelDescription.xml."""
-        root = ET.Element(
-            "fmiModelDescription",
-            {
-                "fmiVersion": "2.0",
-                "modelName": self.identifier,
-                "guid": self.token,
-                "generationTool": f"cangauge {__version__}",
-                "variableNamingConvention": "structured",
-            },
-        )
-        interface = ET.SubElement(
-            root,
-            "CoSimulation",
-            {
-                "modelIdentifier": self.identifier,
-                "canHandleVariableCommunicationStepSize": "true",
-                "canGetAndSetFMUstate": "true",
-            },
-        )
-        files = ET.SubElement(interface, "SourceFiles")
-        for name in self.sources:
-            ET.SubElement(files, "File", name=name)
-        units = ET.SubElement(root, "UnitDefinitions")
-        for name, base in UNITS.items():
-            ET.SubElement(ET.SubElement(units, "Unit", name=name), "BaseUnit", base)
-        ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=str(STEP_S))
-        variables = ET.SubElement(root, "ModelVariables")
-        for reference, item in enumerate(self.variables):
-            _add(variables, reference, item)
-        structure = ET.SubElement(root, "ModelStructure")
         outputs = [k for k, item in enumerate(self.variables) if item.causality == "output"]
-        for tag in ("Outputs", "InitialUnknowns"):
-            parent = ET.SubElement(structure, tag)
-            for reference in outputs:
-                ET.SubElement(parent, "Unknown", index=str(reference + 1))
-        ET.indent(root)
-        text: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
-        return text
+        return DESCRIPTION.format(
+            name=self.identifier,
+            token=self.token,
+            version=__version__,
+            files="\n".join(f'      <File name="{name}"/>' for name in self.sources),
+            step_s=STEP_S,
+            variables="\n".join(item.xml(k) for k, item in enumerate(self.variables)),
+            unknowns="\n".join(f'      <Unknown index="{k + 1}"/>' for k in outputs),
+        )
+
+
+TIME: Final = Variable("time", "independent", "s", None, "time")
+CURRENT: Final = Variable("current_a", "input", "A", 0.0, "current, positive = discharge")
+SOC: Final = Variable("soc_pct", "output", "%", None, "state of charge")
 
 
 def _pack_variables(model: Model) -> tuple[Variable, ...]:
     return (
-        Variable("time", "independent", "s", None, "time"),
-        Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
+        TIME,
+        CURRENT,
         Variable(
             "temperature_c",
             "input",
@@ -288,7 +310,7 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
             "measured temperature",
         ),
         Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
-        Variable("soc_pct", "output", "%", None, "state of charge"),
+        SOC,
         Variable(
             "initial_soc_pct",
             "parameter",
@@ -310,11 +332,11 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
 
 def _estimator_variables() -> tuple[Variable, ...]:
     return (
-        Variable("time", "independent", "s", None, "time"),
-        Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
+        TIME,
+        CURRENT,
         Variable("temperature_c", "input", "degC", 20.0, "measured temperature"),
         Variable("voltage_v", "input", "V", 0.0, "measured voltage"),
-        Variable("soc_pct", "output", "%", None, "state of charge"),
+        SOC,
         Variable(
             "initial_soc_pct",
             "parameter",
@@ -352,28 +374,6 @@ def _effect_parameters(
             variables.append(Variable(full, "parameter", None, value, text, range=bounds))
             places.append((number, place))
     return variables, places
-
-
-def _add(parent: ET.Element, reference: int, item: Variable) -> None:
-    """Add a variable to the model's description."""
-    variability = {"parameter": "fixed"}.get(
-        item.causality, "discrete" if item.is_integer else "continuous"
-    )
-    initial = {"output": "calculated", "parameter": "exact"}.get(item.causality)
-    attributes = {
-        "name": item.name,
-        "valueReference": str(reference),
-        "causality": item.causality,
-        "variability": variability,
-        "description": item.description,
-    }
-    attributes |= {} if initial is None else {"initial": initial}
-    outer = ET.SubElement(parent, "ScalarVariable", attributes)
-    limits = zip(("min", "max"), item.range or FINITE, FINITE, strict=True)
-    inner = {name: repr(value) for name, value, end in limits if value != end}
-    inner |= {} if item.start is None else {"start": repr(item.start)}
-    inner |= {} if item.unit is None else {"unit": item.unit}
-    ET.SubElement(outer, "Integer" if item.is_integer else "Real", inner)
 
 
 def _compiler() -> list[str]:
