@@ -1,7 +1,7 @@
 /* cangauge.c - clock, counting, and the step from sample to estimate.
  *
- * Follows the Python modules estimation.counting, estimation.blocks and estimation.estimator; their
- * docstrings state equations and sources.
+ * Follows the Python modules estimation.counting, estimation.state and estimation.estimator; their
+ * docstrings state equations and sources, and units and reasons of the constants below.
  */
 #include "cangauge_internal.h"
 
@@ -197,6 +197,7 @@ cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds)
     return cg_min(rms_a * seconds * cg_pct_per_as(self->model), cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
 }
 
+/* Deviation of the SoC if the car was charged or driven in an interval. */
 static cg_real moved_std_pct(cg_real seconds)
 {
     return cg_min(R(FASTEST_PCT_PER_HOUR) * seconds / R(3600.0), cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
@@ -272,6 +273,7 @@ static void start_count(cg_state *state, cg_real soc_pct, cg_real std_pct)
     state->memory.coulomb_gap_var_pct2 = state->counter.gap_var_pct2;
 }
 
+/* Start filter and count. */
 static void start(cg_estimator *self, cg_real soc_pct, cg_real std_pct, bool is_doubtful)
 {
     cg_filter_start(&self->state.filter, self->model, soc_pct, std_pct, is_doubtful);
@@ -297,6 +299,7 @@ static void set_filter_time(cg_state *state, cg_sum counted_s, cg_sum discharged
     state->memory.filter_gap_var_pct2 = state->counter.gap_var_pct2;
 }
 
+/* Predict the filter to a count. */
 static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
 {
     const cg_passed passed = since_filter(&self->state, counted_s, discharged_pct);

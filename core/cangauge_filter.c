@@ -1,7 +1,7 @@
-/* cangauge_filter.c - Kalman filter of one start, and the weighing of two.
+/* cangauge_filter.c - Kalman filter of one hypothesis, and the weighing of two.
  *
  * Follows the Python modules estimation.ekf, estimation.health (the biases) and estimation.start;
- * their docstrings state equations and sources.
+ * their docstrings state equations and sources, and units and reasons of the constants below.
  */
 #include "cangauge_internal.h"
 

@@ -218,11 +218,17 @@ static cg_real curve_v(const cg_model *model, cg_real soc_pct, cg_real *slope)
            ((at.value[1] * before) + (at.value[2] * rise_v) + (at.value[3] * after));
 }
 
+/* 1/T, of a temperature at which a law of it holds. */
+static cg_real inverse_k(cg_real temperature_c)
+{
+    return R(1.0) / (cg_clip(temperature_c, R(COLDEST_C), R(HOTTEST_C)) + R(ZERO_C_IN_K));
+}
+
+/* Resistance relative to that at the reference temperature, by Arrhenius' law. */
 static cg_real resistance_factor(cg_real temperature_c)
 {
-    const cg_real kelvin = cg_clip(temperature_c, R(COLDEST_C), R(HOTTEST_C)) + R(ZERO_C_IN_K);
-    const cg_real reference = R(RESISTANCE_REFERENCE_C) + R(ZERO_C_IN_K);
-    return cg_exp(R(ACTIVATION_K) * ((R(1.0) / kelvin) - (R(1.0) / reference)));
+    const cg_real reference = R(1.0) / (R(RESISTANCE_REFERENCE_C) + R(ZERO_C_IN_K));
+    return cg_exp(R(ACTIVATION_K) * (inverse_k(temperature_c) - reference));
 }
 
 /* Growth of the voltage errors in the cold, 1 or more. */
@@ -294,6 +300,7 @@ cg_real cg_unknown_temperature_v(const cg_model *model, const cg_real *load)
 
 /* ------------------------------------------------------------------ effects */
 
+/* First-order lag from its first input on. Over a step longer than `rest_s` the input counts as zero. */
 static cg_real lag_step(cg_lag *lag, cg_real tau_s, cg_real rest_s, cg_time time_s, cg_real input)
 {
     const cg_real seconds = cg_seconds(time_s - lag->time_s);
@@ -309,34 +316,21 @@ static cg_real lag_step(cg_lag *lag, cg_real tau_s, cg_real rest_s, cg_time time
     return lag->value;
 }
 
-/* A lag that starts at its first input, or at a given value. */
-static cg_real lag_from(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real input)
+/* The same from a first output on. */
+static cg_real lag_from(cg_lag *lag, cg_real first, cg_real tau_s, cg_real rest_s, cg_time time_s,
+                        cg_real input)
 {
-    if (!lag->is_started) {
-        lag->is_started = true;
-        lag->time_s = time_s;
-        lag->input = input;
-        lag->value = input;
-        return input;
+    if (lag->is_started) {
+        return lag_step(lag, tau_s, rest_s, time_s, input);
     }
-    return lag_step(lag, tau_s, R(INFINITY), time_s, input);
+    *lag = (cg_lag){time_s, input, first, true};
+    return first;
 }
 
+/* Lag of a current: none has flowed before the first. */
 static cg_real lag_from_rest(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real input)
 {
-    if (!lag->is_started) {
-        lag->is_started = true;
-        lag->time_s = time_s;
-        lag->input = input;
-        lag->value = R(0.0);
-        return R(0.0);
-    }
-    return lag_step(lag, tau_s, R(BRIDGE_S), time_s, input);
-}
-
-static cg_real inverse_k(cg_real temperature_c)
-{
-    return R(1.0) / (cg_clip(temperature_c, R(COLDEST_C), R(HOTTEST_C)) + R(ZERO_C_IN_K));
+    return lag_from(lag, R(0.0), tau_s, R(BRIDGE_S), time_s, input);
 }
 
 static cg_real arrhenius(cg_real temperature_c, cg_real activation_k)
@@ -370,7 +364,8 @@ static void correct_core(const cg_effect *effect, cg_effect_state *state, cg_sam
     sample->temperature_c += rise_k * above;
     if ((late != R(0.0)) && !isnan(outside_c)) {
         const cg_real followed =
-            lag_from(&state->lag[1], effect->tau_s[1], sample->time_s, outside_c);
+            lag_from(&state->lag[1], outside_c, effect->tau_s[1], R(INFINITY), sample->time_s,
+                     outside_c);
         sample->temperature_c += late * (followed - outside_c);
     }
 }
@@ -393,8 +388,9 @@ void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to)
             break;
         case CG_TEMPERATURE_LAG:
             if (!isnan(sample->temperature_c)) {
-                const cg_real smooth = lag_from(&state->lag[0], effect->tau_s[0], sample->time_s,
-                                                sample->temperature_c);
+                const cg_real measured_c = sample->temperature_c;
+                const cg_real smooth = lag_from(&state->lag[0], measured_c, effect->tau_s[0],
+                                                R(INFINITY), sample->time_s, measured_c);
                 sample->temperature_c += effect->value[0] * (sample->temperature_c - smooth);
             }
             break;
