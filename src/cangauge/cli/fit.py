@@ -162,7 +162,6 @@ def fit_command(
 
     Model file and report are written together, or neither.
     """
-    from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit
 
     if initial_soc is not None and len(initial_soc) not in {1, len(logs)}:
@@ -193,7 +192,7 @@ def fit_command(
             chemistry=chemistry,
             cells=cells or _cells_of(recorded[0], reading),
             rate_hz=rate_hz,
-            effects=parse_effect_ids(effects) if effects else None,
+            effects=effects,
             **published,
         )
         show("writing")

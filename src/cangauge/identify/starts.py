@@ -268,27 +268,23 @@ def start_by_model(log: Log, model: Model) -> Start:
     Start
         Its standard deviation follows from the model's lasting error.
     """
-    extended = model.extended_model()
+    extended, voltage = model.extended_model(), model.voltage_model()
     low, high = _limits(log, model.capacity_ah)
-    voltage = extended.model
-    rows = fit_rows(
-        with_start(log, 0.5 * (low + high)),
-        model.capacity_ah,
-        delay_s=voltage.loads.delays_s,
-        low_pass_s=voltage.loads.low_pass_s,
-    )
-    signals = Signals.of(log)
+    middle = 0.5 * (low + high)
+    at = fit_rows(with_start(log, middle), model.capacity_ah, delay_s=voltage.loads.delays_s).at
+    prediction = extended.predict(Signals.of(log), middle, at)
+    moved_pct = prediction.soc_pct[at] - middle
 
-    def error_v(start: float) -> float:
-        return float(np.mean(np.abs(extended.predict(signals, start, rows.at).residual_v)))
+    def error_v(start_pct: float) -> float:
+        modelled_v = extended.voltage_at(moved_pct + start_pct, prediction)
+        return float(np.mean(np.abs(prediction.signals.voltage_v[at] - modelled_v)))
 
     best = _minimum(error_v, low, high)
-    functions, noise = model.principal_functions(), model.noise
-    soc = rows.soc_pct - 0.5 * (low + high) + best
-    columns = voltage.load_columns(rows.temperature_c, rows.currents_a).mean(axis=0)
-    middle = float(np.mean(soc))
-    chemistry = CHEMISTRIES[model.chemistry]
-    variance = float(np.sum(functions.row(middle, columns) ** 2)) + noise.level_std_v**2
-    slope = max(float(np.mean(voltage.pseudo_ocv_slope(soc))), SLOPE_AT_LEAST * voltage.nominal_v)
-    std_pct = float(np.hypot(variance**0.5 / slope, chemistry.soc_std_pct))
+    soc_pct, celsius = moved_pct + best, prediction.signals.temperature_c[at]
+    columns = voltage.load_columns(celsius, prediction.currents_a).mean(axis=0)
+    by_functions = model.principal_functions().row(float(np.mean(soc_pct)), columns)
+    lasting_v = np.hypot(np.linalg.norm(by_functions), model.noise.level_std_v)
+    slope = float(np.mean(voltage.pseudo_ocv_slope(soc_pct)))
+    slope = max(slope, SLOPE_AT_LEAST * voltage.nominal_v)
+    std_pct = float(np.hypot(lasting_v / slope, CHEMISTRIES[model.chemistry].soc_std_pct))
     return Start(log, best, "estimated", std_pct)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -23,7 +23,7 @@ from cangauge.extras.report.charts import (
     stacked,
 )
 from cangauge.extras.report.page import Block, Page, Table, Tile, joined, range_rows
-from cangauge.identify.identification import Identification, LogFit
+from cangauge.identify.identification import Identification
 from cangauge.identify.rows import running_rows
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model, Published
@@ -101,9 +101,9 @@ def _tiles(result: Identification) -> list[Tile]:
 # --- Figures
 
 
-def _over_time(
-    result: Identification, values: Callable[[LogFit], FloatArray]
-) -> list[tuple[FloatArray, FloatArray]]:
+def _over_time(result: Identification, name: str) -> list[tuple[FloatArray, FloatArray]]:
+    """Return time and an attribute of each log's fit."""
+    values = attrgetter(name)
     return [(item.rows.time_s, values(item)) for item in result.fits]
 
 
@@ -116,9 +116,9 @@ def _voltage_figure(result: Identification, time: TimeFigures) -> Figure:
         height=320,
         names=True,
     )
-    measured = _over_time(result, lambda item: item.rows.voltage_v)
-    model = _over_time(result, lambda item: item.voltage_model_v)
-    curve = _over_time(result, lambda item: item.pseudo_ocv_v)
+    measured = _over_time(result, "rows.voltage_v")
+    model = _over_time(result, "voltage_model_v")
+    curve = _over_time(result, "pseudo_ocv_v")
     time.line(figure, "measured", measured, BLACK, line_width=1.2)
     time.line(figure, "model", model, ORANGE, line_width=1.0, line_alpha=0.85)
     return time.line(figure, "pseudo-OCV", curve, BLUE, line_width=1.8)
@@ -182,7 +182,7 @@ def slope_figure(model: VoltageModel, caption: str) -> Figure:
 
 def _error_figures(result: Identification, time: TimeFigures) -> list[Figure]:
     """Return the error over time and its histogram, of the fit and on rows held out of it."""
-    fitted = _over_time(result, lambda item: item.residual_v)
+    fitted = _over_time(result, "residual_v")
     parts = [("fit", np.concatenate([values for _, values in fitted]), BLUE)]
     held_out = [
         (item.rows.time_s, values)
@@ -252,8 +252,8 @@ def _newton_figure(result: Identification, time: TimeFigures) -> Figure:
         height=280,
         names=True,
     )
-    newton = _over_time(result, lambda item: item.soc_newton_pct)
-    counted = _over_time(result, lambda item: item.rows.soc_pct)
+    newton = _over_time(result, "soc_newton_pct")
+    counted = _over_time(result, "rows.soc_pct")
     time.line(figure, "Newton", newton, ORANGE, line_width=0.9, line_alpha=0.8)
     return time.line(figure, "counted", counted, BLACK, line_width=2.0)
 
