@@ -33,7 +33,7 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class GaussianPosterior:
-    """GaussianPosterior of θ.
+    """Posterior of θ: a normal distribution.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Added:
     log_factor : array
         Gain of log evidence (log Bayes factor against that model).
     mean, std : array
-        GaussianPosterior of its coefficient.
+        Posterior of its coefficient.
     """
 
     log_evidence: float
