@@ -231,6 +231,12 @@ def test_published_options_move_with_the_equation() -> None:
     assert found.voltage_model.loads.t_ref_c == 15.0
 
 
+@pytest.mark.parametrize("epsilon", [0.0, 0.5, 0.7, float("nan")])
+def test_an_epsilon_where_the_logarithms_diverge_is_refused(epsilon: float) -> None:
+    with pytest.raises(InputError, match=r"epsilon: must lie between 0 and 0\.5"):
+        fit([synthetic_log(hours=0.6)], equation="published", epsilon=epsilon)
+
+
 def test_falling_published_curve_is_refused() -> None:
     log = synthetic_log(hours=0.6, start_pct=80.0, end_pct=72.0)
     slow = 6.0 * np.sin(np.linspace(0.0, 9.0, len(log)))

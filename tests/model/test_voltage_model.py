@@ -83,7 +83,6 @@ def test_refuses_a_falling_pseudo_ocv() -> None:
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"epsilon": 0.0}, "epsilon"),
         ({"soc_range_pct": (50.0, 50.0)}, "soc_range_pct"),
         ({"soc_range_pct": (0.0, 5e-324)}, "soc_range_pct"),
     ],

@@ -60,7 +60,7 @@ from cangauge.model.model_file import (
     SourceLog,
 )
 from cangauge.model.noise import Noise
-from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior, usual_loads
+from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior
 from cangauge.model.voltage_model import KNOTS_PCT, Ranges
 
 Equation = Literal["knots", "published"]
@@ -139,6 +139,13 @@ def fit(
         require_number(capacity_ah, "capacity_ah")
     if cells is not None and not cells >= 1:
         raise InputError("a pack has at least one cell", field="cells", value=cells)
+    if not 0.0 < epsilon < 0.5:
+        raise InputError(
+            "must lie between 0 and 0.5, or the logarithms diverge",
+            field="epsilon",
+            value=epsilon,
+            cure="the published value is 0.05",
+        )
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
     stated_pct = given_starts(initial_soc_pct, len(recorded))
@@ -454,14 +461,13 @@ def _fit_published(
     errors = _held_out(rows, errors_v)
     mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
     judged = _judged(errors, rows, published.residual_v, mean_v)
-    jacobian = published.jacobian()
+    jacobian, found = published.jacobian(), published.fields()
+    covariance = jacobian @ published.covariance @ jacobian.T
     model = Model(
         equation="published",
-        published=published.fields(),
+        published=found,
         functions=FunctionFields.of(
-            fields["chemistry"],
-            jacobian @ published.covariance @ jacobian.T,
-            usual_loads(fields["capacity_ah"], len(equation.delay_s)),
+            fields["chemistry"], covariance, found.loads, fields["capacity_ah"]
         ),
         noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),
         **fields,

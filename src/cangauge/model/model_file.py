@@ -42,7 +42,6 @@ from cangauge.model.prior import (
     Distribution,
     PackPrior,
     principal_functions,
-    usual_loads,
 )
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -109,18 +108,21 @@ class Published(Fields):
             delays_s=tuple(delays_s),
         )
 
-    def voltage_model(self, known: Ranges) -> VoltageModel:
-        """Return the voltage model, identified within some ranges."""
-        n = len(BASIS_NAMES)
-        values = [self.coefficients[name].value for name in _names(self.delays_s)]
-        loads = Loads(
+    @property
+    def values(self) -> list[float]:
+        """The coefficients k0 … k7, kt, R1 … Rn."""
+        return [self.coefficients[name].value for name in _names(self.delays_s)]
+
+    @property
+    def loads(self) -> Loads:
+        """The part of the equation beside its curve."""
+        kt, *ohm = self.values[len(BASIS_NAMES) :]
+        return Loads(
             t_ref_c=self.t_ref_c,
-            kt_v_per_k=values[n],
+            kt_v_per_k=kt,
             delays_s=self.delays_s,
-            resistance_ohm=tuple(values[n + 1 :]),
+            resistance_ohm=tuple(ohm),
         )
-        curve = PublishedCurve(tuple(values[:n]), self.epsilon, known.soc_pct)
-        return VoltageModel(curve, loads, known)
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -152,10 +154,12 @@ class FunctionFields(Fields):
     """Part of each function in the coefficients of the load columns."""
 
     @classmethod
-    def of(cls, chemistry: ChemistryName, covariance: FloatArray, loads: FloatArray) -> Self:
+    def of(
+        cls, chemistry: ChemistryName, covariance: FloatArray, loads: Loads, capacity_ah: float
+    ) -> Self:
         """Return a covariance of knots and load coefficients (`prior.principal_functions`)."""
         number, n = CHEMISTRIES[chemistry].functions, KNOTS_PCT.size
-        functions = principal_functions(covariance, loads, number)
+        functions = principal_functions(covariance, loads, capacity_ah, number)
         curve_v, load = functions[:, :n].tolist(), functions[:, n:].tolist()
         return cls(soc_pct=KNOTS_PCT.tolist(), curve_v=curve_v, load=load)
 
@@ -268,7 +272,9 @@ class Model(Fields):
             knots = np.array(self.curve.soc_pct), np.array(self.curve.voltage_v)
             return VoltageModel(HermiteCurve.rising(*knots), self.loads, self.range)
         if self.equation == "published" and self.published is not None:
-            return self.published.voltage_model(self.range)
+            ocv_v = tuple(self.published.values[: len(BASIS_NAMES)])
+            curve = PublishedCurve(ocv_v, self.published.epsilon, self.range.soc_pct)
+            return VoltageModel(curve, self.published.loads, self.range)
         lacking = "published" if self.equation == "published" else "curve, loads"
         raise InputError(f"missing, though the equation is {self.equation}", field=lacking)
 
@@ -414,24 +420,22 @@ class Model(Fields):
             The other fields of `Model`.
         """
         n, p = KNOTS_PCT.size, KNOTS_PCT.size + known.arrhenius_ohm.size + 2
+        chemistry: ChemistryName = fields["chemistry"]
         kt, *ohm, b = known.coefficients[n:p].tolist()
-        r0_ohm = known.arrhenius_ohm
-        loads = usual_loads(fields["capacity_ah"], len(ohm), r0_ohm)
+        loads = Loads(
+            kt_v_per_k=kt,
+            low_pass_s=LOW_PASS_S,
+            resistance_ohm=tuple(ohm),
+            arrhenius=Arrhenius(b, tuple(known.arrhenius_ohm.tolist()), known.mean_c),
+        )
+        curve_v = known.coefficients[:n].tolist()
+        covariance = known.covariance[:p, :p]
         return cls(
             equation="knots",
-            curve=CurveKnots(
-                soc_pct=tuple(KNOTS_PCT.tolist()), voltage_v=tuple(known.coefficients[:n].tolist())
-            ),
-            loads=Loads(
-                kt_v_per_k=kt,
-                low_pass_s=LOW_PASS_S,
-                resistance_ohm=tuple(ohm),
-                arrhenius=Arrhenius(b, tuple(r0_ohm.tolist()), known.mean_c),
-            ),
-            functions=FunctionFields.of(fields["chemistry"], known.covariance[:p, :p], loads),
-            noise=Noise.of(
-                fields["chemistry"], known.mean_v, known.residual_v, judged, known.scale
-            ),
+            curve=CurveKnots(soc_pct=tuple(KNOTS_PCT.tolist()), voltage_v=tuple(curve_v)),
+            loads=loads,
+            functions=FunctionFields.of(chemistry, covariance, loads, fields["capacity_ah"]),
+            noise=Noise.of(chemistry, known.mean_v, known.residual_v, judged, known.scale),
             **fields,
         )
 

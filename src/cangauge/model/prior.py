@@ -101,7 +101,6 @@ class Chemistry:
 
     Parameters
     ----------
-    name : {"oxide", "lfp"}
     curve_v : array of shape (knots,)
         Open-circuit voltage of a typical cell at `KNOTS_PCT` [V].
     other_v : array of shape (knots,)
@@ -121,7 +120,6 @@ class Chemistry:
         polarization, so they grow with the resistance.
     """
 
-    name: ChemistryName
     curve_v: FloatArray
     other_v: FloatArray
     slope_std: float
@@ -193,7 +191,6 @@ iron phosphate
 
 CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
     "oxide": Chemistry(
-        "oxide",
         _LAYERED_V,
         _SPINEL_V,
         slope_std=5e-4,
@@ -205,7 +202,6 @@ CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
         cold_exponent=1.5,
     ),
     "lfp": Chemistry(
-        "lfp",
         _PHOSPHATE_V,
         _PHOSPHATE_V,
         slope_std=2e-4,
@@ -316,7 +312,9 @@ class PackPrior:
         return Distribution(mean, covariance, -h_mean, RESIDUAL_STD * mean_v, mean_v, REFERENCE_C)
 
 
-def principal_functions(covariance: FloatArray, loads: FloatArray, number: int) -> FloatArray:
+def principal_functions(
+    covariance: FloatArray, loads: Loads, capacity_ah: float, number: int
+) -> FloatArray:
     """Return the joint principal functions of the coefficients' covariance, shape (n, p).
 
     They explain most of the variance of the voltage, over all SoC and the loads of a usual drive.
@@ -325,39 +323,24 @@ def principal_functions(covariance: FloatArray, loads: FloatArray, number: int) 
     ----------
     covariance : array of shape (p, p)
         Of the knots and the coefficients of the load columns.
-    loads : array of shape (k,)
-        Usual sizes of the load columns (`usual_loads`).
+    loads : Loads
+    capacity_ah : float
+        [Ah].
     number : int
         n.
     """
+    usual_a = TYPICAL_C_RATE * capacity_ah
+    usual = [TYPICAL_K, *[usual_a] * len(loads.resistance_ohm)]
+    if loads.arrhenius is not None:
+        total_ohm = abs(float(np.sum(loads.arrhenius.resistance_ohm)))
+        usual.append(TYPICAL_COLDER * usual_a * total_ohm)
     basis = hermite_basis(np.linspace(0.0, 100.0, 401))
     n = KNOTS_PCT.size
     weight = np.zeros_like(covariance)
     weight[:n, :n] = basis.T @ basis / len(basis)
-    weight[n:, n:] = np.diag(loads**2)
+    weight[n:, n:] = np.diag(np.array(usual) ** 2)
     root = np.linalg.cholesky(weight)
     variance, direction = np.linalg.eigh(root.T @ covariance @ root)
     first = np.argsort(variance)[::-1][:number]
     scaled = direction[:, first] * np.sqrt(np.maximum(variance[first], 0.0))
     return np.asarray(np.linalg.solve(root.T, scaled).T)
-
-
-def usual_loads(
-    capacity_ah: float, currents: int, arrhenius_ohm: FloatArray | None = None
-) -> FloatArray:
-    """Return the usual sizes of the load columns: T − T_r, currents, and the Arrhenius change.
-
-    Parameters
-    ----------
-    capacity_ah : float
-        [Ah].
-    currents : int
-        Number of delayed and low-passed currents.
-    arrhenius_ohm : array of shape (M,), optional
-        Resistances that b scales [Ω]; None where the model has no b.
-    """
-    usual_a = TYPICAL_C_RATE * capacity_ah
-    loads = [TYPICAL_K, *[usual_a] * currents]
-    if arrhenius_ohm is not None:
-        loads.append(TYPICAL_COLDER * usual_a * abs(float(np.sum(arrhenius_ohm))))
-    return np.array(loads)

@@ -293,7 +293,7 @@ class PublishedCurve:
     Raises
     ------
     InputError
-        If ε or the range is impossible, or the curve does not rise over the range.
+        If the range is impossible, or the curve does not rise over it.
     """
 
     ocv_v: tuple[float, ...]
@@ -301,13 +301,6 @@ class PublishedCurve:
     soc_range_pct: tuple[float, float] = (0.0, 100.0)
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.epsilon < 0.5:
-            raise InputError(
-                "must lie between 0 and 0.5, or the logarithms diverge",
-                field="epsilon",
-                value=self.epsilon,
-                cure="the published value is 0.05",
-            )
         low, high = self.soc_range_pct
         if not high - low >= NARROWEST_SOC_PCT:
             raise InputError("the range is empty", field="soc_range_pct", value=(low, high))
