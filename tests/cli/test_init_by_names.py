@@ -103,6 +103,8 @@ def test_no_map_is_made_of_other_signals(tmp_path: Path, name: str) -> None:
     assert done.out.startswith("No map: ")
     assert why in " ".join(done.out.replace("\n", " ").split())
     assert "nothing was written" in done.err
+    is_absent = "nothing can be" in done.err  # no drive would show it
+    assert ("record a drive" in done.err, "docs/map-file.md" in done.err) != (is_absent, is_absent)
     assert not (tmp_path / "out").exists()
 
 

@@ -174,7 +174,7 @@ def test_a_low_voltage_modules_scale_is_among_the_levels_or_stated(
     frames = (Frame(0x618, 0.1, 8, MODULE), Frame(0x300, 0.01, 8, {"speed": Bits(0, 8, True, 1.0)}))
     module = Car("module", frames, *((0x618, MODULE[each]) for each in ("current", "voltage")),
                  volts=52.0, ohm=0.01)  # fmt: skip
-    open_scale = search(capture(module)).voltage[0].levels(None)
+    open_scale = search(capture(module)).voltage[0].levels
     assert any(each.scale == 0.01 and 45.0 < each.value < 54.0 for each in open_scale)
     stated = search(capture(module), nominal_v=52.0)
     assert stated.voltage[0].scale == 0.01

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import product
+from operator import attrgetter
 from statistics import median
 from typing import Any, ClassVar, Final
 
@@ -25,9 +25,9 @@ from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec, signal_codec
 from cangauge.bus.vehicle import EXTENDED
 from cangauge.errors import InputError
-from cangauge.extras.discovery.candidate import MOST_A, Level, range_text
+from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate, range_text
 from cangauge.extras.discovery.fields import LEAST_BITS
-from cangauge.extras.discovery.pairs import FEW_MOVES, SHOWN
+from cangauge.extras.discovery.pairs import FEW_MOVES
 from cangauge.logs.sign import correlation
 from cangauge.logs.units import unit_of
 
@@ -36,17 +36,6 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-_QUANTITIES: Final = {
-    "current": ("current_a", _words("current curr cur crnt amp amps ampere strom i ibat ibatt")),
-    "voltage": (
-        "voltage_v",
-        _words("voltage volt volts vlt vol spannung u v ubat ubatt vbat vbatt"),
-    ),
-    "soc_reference": ("soc_pct", _words("soc stateofcharge ladezustand")),
-    "temperature": ("temperature_c", _words("temperature temperatur temp temps")),
-}
-"""Column of a log and words by role."""
-_MEASURED: Final = frozenset[str]().union(*(words for _, words in _QUANTITIES.values()))
 _ANY_BATTERY: Final = _words("battery batt bat batteries batterie ibat ibatt ubat ubatt vbat vbatt")
 _HIGH: Final = _words("hv hvlt highvoltage hochvolt")
 """With one of these it is the pack. Alone they may be any part of a high voltage."""
@@ -80,18 +69,17 @@ _RUNS: Final = re.compile(r"[a-z]+")
 _KNOWN: Final = re.compile(
     "|".join(
         word
-        for word in sorted(_BATTERY | _HIGH | _PARTS | _LIMITS | _MEASURED, key=len, reverse=True)
+        for word in sorted(
+            _BATTERY.union(
+                _HIGH, _PARTS, _LIMITS, *(_words(each.words) for each in ROLES.values())
+            ),
+            key=len,
+            reverse=True,
+        )
         if len(word) > 1
     )
 )
 _JOINED: Final = re.compile(f"(?:{_KNOWN.pattern})++")
-_RANGES: Final = {
-    "current": (-MOST_A, MOST_A),
-    "voltage": (30.0, 1000.0),
-    "temperature": (-30.0, 60.0),
-    "soc_reference": (0.0, 100.0),
-}
-"""Plausible medians of the distinct values [A, V, °C, %]."""
 _HIGH_V: Final = 65.536
 """Range of a signal beyond which it is of a high voltage (over 60 V): 16 bits of a millivolt, with
 which batteries of 12–48 V are measured."""
@@ -101,33 +89,30 @@ _FOLLOWED: Final = 2.0
 """What the physics is worth at most: two matching words."""
 _PROVEN: Final = 0.5
 """Share of a voltage's changes by a current from which on the two need no names."""
+_WEIGHED: Final = 8
+"""Likeliest currents and voltages by name whose pairs are tried."""
 _CODES_APART: Final = 1.0 / 16.0
 """Least distance of a code from the measured numbers, as a share of the signal's range."""
 
 
-@dataclass(frozen=True)
-class NamedSignal:
-    """A signal of a DBC that may have a role.
+def _nothing() -> FloatArray:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NamedSignal(Candidate):
+    """A signal of a DBC; its score is in units of one matching word.
+
+    Its evidence is the share of the voltage's changes that follow the current, by the best partner.
 
     Parameters
     ----------
-    message, signal, unit : str
     bits, holds : int, tuple of float
         Length and range that the DBC gives it; the range in its unit.
-    score : float
-        Larger is likelier; in units of one matching word.
     against : tuple of str
         Why it may not have the role.
-    low, high : float
-        Range of its values in the whole capture, in the DBC's unit; NaN without frames.
-    sign : int
-        −1 where positive values charge.
     is_wrapped : bool
         Whether the DBC reads a signed number as an unsigned one.
-    evidence : float
-        Share of the voltage's changes that follow the current, by the best partner.
-    period_s : float
-        Median interval of its message [s]; NaN without frames.
     not_available : tuple of int
         Codes in the capture that mean "no value".
     time_s, value : array
@@ -136,22 +121,13 @@ class NamedSignal:
 
     HEAD: ClassVar = ("signal, by name and unit", "range", "against it")
 
-    message: str
-    signal: str
-    unit: str
     bits: int
     holds: tuple[float, float]
-    score: float = 0.0
     against: tuple[str, ...] = ()
-    low: float = math.nan
-    high: float = math.nan
-    sign: int = 1
     is_wrapped: bool = False
-    evidence: float = 0.0
-    period_s: float = math.nan
     not_available: tuple[int, ...] = ()
-    time_s: FloatArray = field(default_factory=lambda: np.empty(0), repr=False)
-    value: FloatArray = field(default_factory=lambda: np.empty(0), repr=False)
+    time_s: FloatArray = field(default_factory=_nothing, repr=False)
+    value: FloatArray = field(default_factory=_nothing, repr=False)
 
     @property
     def name(self) -> str:
@@ -169,24 +145,13 @@ class NamedSignal:
         return not self.against or self.is_followed
 
     @property
-    def range_text(self) -> str:
-        """Range of its values, discharge positive; "" without frames."""
-        if math.isnan(self.low):
-            return ""
-        return range_text(self.low, self.high, self.unit.replace("degC", "°C"), self.sign)
-
-    @property
     def cells(self) -> tuple[str, ...]:
         """Cells of a table under `HEAD`."""
         against = "" if self.is_fit else "; ".join(self.against)
         holds = f"by DBC {range_text(*self.holds, self.unit)}"
         return f"{self.message}\n{self.signal}", self.range_text or holds, against
 
-    def levels(self, nominal_v: float | None) -> list[Level]:  # noqa: ARG002 - as of a field
-        """Return nothing: a DBC states the scale."""
-        return []
-
-    def comments(self, nominal_v: float | None) -> list[str]:  # noqa: ARG002 - as of a field
+    def comments(self) -> list[str]:
         """Return the lines that the map states of it."""
         ends = self.range_text
         lines = [f"By name and unit{f'; {ends} in the capture' if ends else ', in no capture'}."]
@@ -197,14 +162,11 @@ class NamedSignal:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
+        names = ("message", "signal", "unit", "score", "evidence")
         return {
-            "message": self.message,
-            "signal": self.signal,
-            "unit": self.unit,
-            "score": self.score,
-            "against": list(self.against),
-            "evidence": self.evidence,
-            "not_available": list(self.not_available),
+            **{name: getattr(self, name) for name in names},
+            "against": [*self.against],
+            "not_available": [*self.not_available],
             "range": None if math.isnan(self.low) else [self.low, self.high],
         }
 
@@ -212,6 +174,51 @@ class NamedSignal:
         """Whether two signals are of one message, or of one pack by a word of both names."""
         shared = _words_of(self.name) & _words_of(other.name) & _BATTERY
         return self.message == other.message or bool(shared - _ANY_BATTERY)
+
+    def judged(self, role: str, nominal_v: float | None) -> NamedSignal | None:
+        """Return it with its score for a role and what speaks against it; None: it has none."""
+        wanted, own, of = ROLES[role], _words_of(self.signal), _words_of(self.message)
+        unit = unit_of(wanted.column, self.unit) if self.unit else None
+        scale, offset = unit or (1.0, 0.0)
+        is_soc, is_pair = role == "soc_reference", role in {"current", "voltage"}
+        is_named = bool(own & _words(wanted.words)) or (is_soc and {"state", "charge"} <= own)
+        names_pack = bool(own & _BATTERY)
+        others, parts = own & (_LIMITS | _PARTS), of & _PARTS
+        if role == "temperature":
+            others -= _EXTREMES
+        elif is_pair and not names_pack:
+            others |= own - _words(wanted.words) - _NEUTRAL
+        lowest, highest = wanted.within
+        middle = median(scale * np.unique(self.value) + offset) if len(self.value) else lowest
+        if not lowest <= middle <= highest or not (unit or (is_named and not self.unit)):
+            return None
+        if not is_pair and (parts or (others if role == "temperature" else own & _PARTS)):
+            return None
+        score = (
+            2.0 * (is_named or role == "temperature")
+            + 1.0 * (unit is not None)
+            + 1.0 * names_pack
+            + 0.5 * bool(of & _BATTERY)
+            - 1.5 * bool(others)
+            - 0.5 * bool(of & (_LIMITS | _PARTS))
+        )
+        if score <= 0.0 or (is_soc and not is_named):
+            return None
+        other = others or (frozenset() if names_pack else parts)
+        most_a, top_v = scale * max(-self.low, self.high), scale * self.holds[1] + offset
+        objections = {
+            "no unit": unit is None,
+            f"{self.bits} bits": self.bits < LEAST_BITS,
+            f"no word for a {role} in its name": is_pair and not is_named,
+            "no word for a pack in its name": is_pair and not (own | of) & _BATTERY,
+            f"of another value: {', '.join(sorted(other))}": other,
+            f"reaches {most_a:.4g} A": role == "current" and unit and most_a > MOST_A,
+            f"holds up to {top_v:.4g} V": (
+                role == "voltage" and unit and top_v <= (nominal_v or _HIGH_V)
+            ),
+        }
+        against = tuple(text for text, holds in objections.items() if holds)
+        return replace(self, role=role, score=score, against=against)
 
 
 def named_signals(
@@ -236,7 +243,7 @@ def named_signals(
         message.frame_id | (EXTENDED if message.is_extended_frame else 0): message
         for message in database.messages
     }
-    frames: dict[int, _NamedFrames] = defaultdict(_NamedFrames)
+    frames: defaultdict[int, _NamedFrames] = defaultdict(_NamedFrames)
     is_capture = False
     for each in messages:
         is_capture = True
@@ -246,24 +253,24 @@ def named_signals(
     if is_capture and not frames:
         cure = "is it of this car and this bus?"
         raise InputError("no message of this DBC is in the capture", field="--dbc", cure=cure)
-    found: dict[str, list[NamedSignal]] = {role: [] for role in _QUANTITIES}
+    found: dict[str, list[NamedSignal]] = {role: [] for role in ROLES}
     for key in list(frames) if is_capture else of_dbc:
         for made in frames[key].signals(of_dbc[key]):
-            for role in _QUANTITIES:
-                if judged := _judged(role, made, nominal_v):
+            for role, signals in found.items():
+                if judged := made.judged(role, nominal_v):
                     is_missing = is_capture and not len(made.value)
                     is_still = role == "current" and made.low == made.high
                     score = judged.score - 1.0 * is_missing - 0.5 * is_still
-                    found[role].append(replace(judged, score=score))
-    for each_role in found.values():
-        each_role.sort(key=lambda one: -one.score)
+                    signals.append(replace(judged, score=score))
+    for signals in found.values():
+        signals.sort(key=attrgetter("score"), reverse=True)
     _weigh(found["current"], found["voltage"])
     current, voltage = found["current"], found["voltage"]
     found["current"] = _partnerless(current, voltage, "voltage")
     found["voltage"] = _partnerless(voltage, current, "current")
-    for each_role in found.values():
-        each_role.sort(key=lambda one: (not one.is_fit, -one.score))
-    return {role: tuple(each[:SHOWN]) for role, each in found.items()}
+    for signals in found.values():
+        signals.sort(key=attrgetter("is_fit", "score"), reverse=True)
+    return {role: tuple(signals[:SHOWN]) for role, signals in found.items()}
 
 
 def clear_roles(found: Mapping[str, Sequence[NamedSignal]]) -> list[str]:
@@ -289,13 +296,12 @@ def clear_roles(found: Mapping[str, Sequence[NamedSignal]]) -> list[str]:
     return clear
 
 
-@dataclass
 class _NamedFrames:
     """Frames of one message: their times, and which of its distinct payloads each holds."""
 
-    time_s: array[float] = field(default_factory=lambda: array("d"))
-    number: array[int] = field(default_factory=lambda: array("L"))
-    payloads: dict[bytes, int] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.time_s, self.number = array("d"), array("L")
+        self.payloads: dict[bytes, int] = {}
 
     def add(self, message: can.Message) -> None:
         """Add a frame."""
@@ -315,7 +321,13 @@ class _NamedFrames:
         if signal.minimum is not None and signal.maximum is not None:
             low, high = max(low, float(signal.minimum)), min(high, float(signal.maximum))
         bits = codec.field.width
-        nothing = NamedSignal(message.name, signal.name, codec.unit, bits, (low, high))
+        nothing = NamedSignal(
+            message=message.name,
+            signal=signal.name,
+            unit=codec.unit,
+            bits=bits,
+            holds=(low, high),
+        )
         decoded = self._decoded(codec, message.length)
         is_wrapped = codec.wrapped_bits(decoded) == bits
         if is_wrapped:
@@ -324,17 +336,15 @@ class _NamedFrames:
         codes = _codes(codec, decoded)
         decoded[np.isin(codec.raw_numbers(decoded), codes)] = math.nan
         value, time_s = decoded[np.array(self.number)], np.array(self.time_s)
-        good = np.isfinite(value)
-        if not good.any():
+        value, time_s = value[np.isfinite(value)], time_s[np.isfinite(value)]
+        if not len(value):
             return nothing
-        value, time_s = value[good], time_s[good]
-        period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.nan
         return replace(
             nothing,
             low=float(value.min()),
             high=float(value.max()),
             is_wrapped=is_wrapped,
-            period_s=period_s,
+            period_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.nan,
             not_available=tuple(codes),
             time_s=time_s,
             value=value,
@@ -368,15 +378,13 @@ def _codes(codec: SignalCodec, values: FloatArray) -> list[int]:
 
 def _weigh(currents: list[NamedSignal], voltages: list[NamedSignal]) -> None:
     """Add the physics to the scores of the likeliest currents and voltages by name."""
-    shares = {
-        (a, b): _followed(currents[a], voltages[b])
-        for a, b in product(range(min(len(currents), 8)), range(min(len(voltages), 8)))
-    }
+    shares = np.array([[_followed(i, u) for u in voltages[:_WEIGHED]] for i in currents[:_WEIGHED]])
     for axis, signals in enumerate((currents, voltages)):
-        for number, each in enumerate(signals):
-            best = max((share for pair, share in shares.items() if pair[axis] == number), default=0)
-            score = each.score + _FOLLOWED * round(4.0 * best) / 4.0  # equal of equal packs
-            signals[number] = replace(each, score=score, evidence=best)
+        best = shares.max(1 - axis).tolist() if shares.size else []
+        for number, share in enumerate(best):
+            each = signals[number]
+            score = each.score + _FOLLOWED * round(4.0 * share) / 4.0  # equal of equal packs
+            signals[number] = replace(each, score=score, evidence=share)
 
 
 def _partnerless(
@@ -424,84 +432,3 @@ def _words_of(name: str) -> frozenset[str]:
     if words & _HIGH and words & _ANY_BATTERY:
         words.add("hvbattery")
     return frozenset(words)
-
-
-@dataclass(frozen=True)
-class _Names:
-    """What the names and the unit of a signal say of a role: words of signal and message."""
-
-    role: str
-    own: frozenset[str]
-    of: frozenset[str]
-    unit: tuple[float, float] | None
-
-    @property
-    def is_named(self) -> bool:
-        """Whether the signal's name has a word of the role."""
-        _, quantity = _QUANTITIES[self.role]
-        is_soc = self.role == "soc_reference" and {"state", "charge"} <= self.own
-        return bool(self.own & quantity) or is_soc
-
-    @property
-    def others(self) -> frozenset[str]:
-        """Words of another value, or of another part, in the signal's name."""
-        others = self.own & (_LIMITS | _PARTS)
-        if self.role == "temperature":
-            others -= _EXTREMES
-        elif self.role != "soc_reference" and not self.own & _BATTERY:
-            others |= self.own - _QUANTITIES[self.role][1] - _NEUTRAL
-        return others
-
-    def score(self) -> float:
-        """Return how well they fit, in matching words; 0 where they do not."""
-        is_other_part = bool((self.own | self.of) & _PARTS)
-        if self.role == "temperature" and (self.others or is_other_part):
-            return 0.0
-        if self.role == "soc_reference" and (is_other_part or not self.is_named):
-            return 0.0
-        return (
-            2.0 * (self.is_named or self.role == "temperature")
-            + 1.0 * (self.unit is not None)
-            + 1.0 * bool(self.own & _BATTERY)
-            + 0.5 * bool(self.of & _BATTERY)
-            - 1.5 * bool(self.others)
-            - 0.5 * bool(self.of & (_LIMITS | _PARTS))
-        )
-
-    def against(self, signal: NamedSignal, nominal_v: float | None) -> list[str]:
-        """Return what speaks against a signal."""
-        against = [] if self.unit else ["no unit"]
-        if signal.bits < LEAST_BITS:
-            against.append(f"{signal.bits} bits")
-        if self.role in {"current", "voltage"}:
-            if not self.is_named:
-                against.append(f"no word for a {self.role} in its name")
-            if not (self.own | self.of) & _BATTERY:
-                against.append("no word for a pack in its name")
-        if other := self.others or (self.of & _PARTS if not self.own & _BATTERY else ()):
-            against.append(f"of another value: {', '.join(sorted(other))}")
-        if self.role == "current" and self.unit:
-            most_a = self.unit[0] * max(-signal.low, signal.high)
-            if most_a > MOST_A:  # false for NaN
-                against.append(f"reaches {most_a:.4g} A")
-        if self.role == "voltage" and self.unit:
-            top_v = self.unit[0] * signal.holds[1] + self.unit[1]
-            if top_v <= (nominal_v or _HIGH_V):
-                against.append(f"holds up to {top_v:.4g} V")
-        return against
-
-
-def _judged(role: str, signal: NamedSignal, nominal_v: float | None) -> NamedSignal | None:
-    """Return a signal with its score for a role and what speaks against it; None: it has none."""
-    column, _ = _QUANTITIES[role]
-    unit = unit_of(column, signal.unit) if signal.unit else None
-    names = _Names(role, _words_of(signal.signal), _words_of(signal.message), unit)
-    lowest, highest = _RANGES[role]
-    scale, offset = unit or (1.0, 0.0)
-    middle = median(scale * np.unique(signal.value) + offset) if len(signal.value) else lowest
-    is_possible = lowest <= middle <= highest
-    is_known = unit is not None or (not signal.unit and names.is_named)
-    if not (is_known and is_possible and names.score() > 0.0):
-        return None
-    against = tuple(names.against(signal, nominal_v))
-    return replace(signal, score=names.score(), against=against)

@@ -30,13 +30,17 @@ _ROLES: Final = {
 }
 """Roles by their names on the command line."""
 _NEEDED: Final = ("current", "voltage")
+_BUS: Final = ("interface", "channel", "bus_options")
 _SCALE_CURES: Final = {
-    "voltage": "Give --nominal-voltage V (by a meter; a type plate is less sure).",
-    "soc_reference": "Compare it with the car's display, and correct the factor in the DBC.",
+    "voltage": ("voltage", "Give --nominal-voltage V (by a meter; a type plate is less sure)."),
+    "soc_reference": (
+        "SoC",
+        "Compare it with the car's display, and correct the factor in the DBC.",
+    ),
 }
 
 
-@command(keys=lambda: config_parameters("interface", "channel", "bus_options"))
+@command(keys=partial(config_parameters, *_BUS))
 def init_command(
     captures: Annotated[
         list[Path] | None, argument("[CAPTURE]…", "Captures of one car, of a drive.")
@@ -92,7 +96,7 @@ def init_command(
     picks = _picks(choose or [])
     _check(output, force=force)
     values = config_values(options)
-    bus = {name: values[name] for name in ("interface", "channel", "bus_options")}
+    bus = {name: values[name] for name in _BUS}
     with tempfile.TemporaryDirectory(prefix="cangauge-init-") as name:
         folder, paths = Path(name), list(captures or [])
         if bus["interface"] is not None or bus["channel"] is not None:
@@ -106,13 +110,13 @@ def init_command(
         proposal = _find(paths, dbc, nominal_voltage, presets=presets)
         unclear = _choose(proposal, picks)
         if unclear or (proposal.method == "physics" and not proposal.has_steps):
-            raise _undecided(proposal, unclear, output, quiet=json_output)
-        _prove(proposal, paths[0] if paths else None, output, bus, folder)
+            raise _undecided(proposal, unclear, nominal_voltage, output, quiet=json_output)
+        _prove(proposal, paths, output, bus, folder)
         texts = proposal.texts(output, bus)
     output.mkdir(parents=True, exist_ok=True)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
-    show = partial(_show, proposal, files, proposal.reading(output), output / "model.json")
+    show = partial(_show, proposal, files, output)
     finish({**proposal.to_dict(), "files": files}, show, as_json=json_output)
 
 
@@ -121,7 +125,7 @@ def _picks(given: Sequence[str]) -> dict[str, int]:
     picks = {}
     for text in given:
         role, _, number = text.partition("=")
-        if role not in _ROLES or not number.isdecimal() or not 1 <= int(number) <= 9:
+        if role not in _ROLES or number not in {*"123456789"}:
             cure = f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2"
             raise InputError("not ROLE=N", field="--choose", value=text, cure=cure)
         picks[_ROLES[role]] = int(number) - 1
@@ -139,8 +143,7 @@ def _check(output: Path, *, force: bool) -> None:
         raise InputError(f"cannot create this folder: {existing} is a file", source=output)
     for name in ("car.toml", "run.toml", "car.dbc"):
         if (output / name).is_file() and not force:
-            cure = "give --force to overwrite it"
-            raise InputError("exists", source=output / name, cure=cure)
+            raise InputError("exists", source=output / name, cure="give --force to overwrite it")
     check_writable(existing / "car.toml")
 
 
@@ -198,32 +201,19 @@ def _find(
     if dbc is not None:
         remarks: list[str] = []
         named = named_signals(load_dbc(dbc, remarks), _joined(paths), nominal_v)
-        return Proposal(
-            "dbc",
-            {**named},
-            clear_roles(named),
-            ("Signals found by their names and units in the DBC.",),
-            tuple(remarks),
-            dbc=dbc,
-            has_steps=any(each.is_followed for each in named["current"]),
-        )
+        head = ("Signals found by their names and units in the DBC.",)
+        proposal = Proposal("dbc", {**named}, clear_roles(named), head, tuple(remarks), dbc=dbc)
+        proposal.has_steps = any(each.is_followed for each in named["current"])
+        return proposal
     if presets and (known := _known(paths)) is not None:
         return Proposal("preset", vehicle=known)
     with progress("cangauge.extras.discovery") as show:
         show("reading frames")
         found = search(_joined(paths), nominal_v)
-    clear = [role for role in _NEEDED if found.is_clear(role)]
-    clear += ["soc_reference"] if found.soc_reference else []
-    candidates = {role: getattr(found, role) for role in (*_NEEDED, "soc_reference")}
-    return Proposal(
-        "physics",
-        candidates,
-        clear,
-        found.comments,
-        found.remarks,
-        nominal_v=nominal_v,
-        has_steps=found.has_steps,
-    )
+    roles = {name: getattr(found, name) for name in (*_NEEDED, "soc_reference")}
+    proposal = Proposal("physics", roles, found.clear, found.comments, found.remarks)
+    proposal.has_steps = found.has_steps
+    return proposal
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -257,20 +247,28 @@ def _choose(proposal: Proposal, picks: Mapping[str, int]) -> list[str]:
 
 
 def _undecided(
-    proposal: Proposal, unclear: Sequence[str], output: Path, *, quiet: bool
+    proposal: Proposal,
+    unclear: Sequence[str],
+    nominal_v: float | None,
+    output: Path,
+    *,
+    quiet: bool,
 ) -> CangaugeError:
     """Return the error of a map that cannot be made; print the candidates, if not `quiet`."""
     absent = [role for role in unclear if not proposal.candidates[role]]
     problem = f"no {' and no '.join(unclear)} is clearly the pack's"
+    cure = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
     if absent:
         problem = f"nothing can be the {' or the '.join(absent)}"
-    cure = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
-    if not proposal.has_steps:
-        cure = "record a drive" if absent else f"record a drive, or {cure}"
-        if proposal.method == "physics":
-            problem = "no voltage follows a current in steps, so that nothing proves the signals"
-            cure = "record a drive"
-    elif proposal.method == "physics" and proposal.nominal_v is None:
+        cure = "record a drive"
+        if proposal.method == "dbc":
+            cure = "give the DBC that has it, or name the signals in a map file (docs/map-file.md)"
+    elif not proposal.has_steps:
+        cure = f"record a drive, or {cure}"
+    if proposal.method == "physics" and not proposal.has_steps:
+        problem = "no voltage follows a current in steps, so that nothing proves the signals"
+        cure = "record a drive"
+    elif proposal.method == "physics" and nominal_v is None:
         problem += ", and the scale of the voltage is open (--nominal-voltage V decides it)"
     if not quiet:
         say(f"No map: {problem}.")
@@ -282,13 +280,9 @@ def _undecided(
 
 
 def _prove(
-    proposal: Proposal,
-    capture: Path | None,
-    output: Path,
-    bus: Mapping[str, Any],
-    folder: Path,
+    proposal: Proposal, paths: Sequence[Path], output: Path, bus: Mapping[str, Any], folder: Path
 ) -> None:
-    """Load what will be saved from a temporary folder, and decode a capture by it.
+    """Load what will be saved from a temporary folder, and decode the first capture by it.
 
     Sets `proof`, and the sign of a DBC's current, which the saved map then states.
 
@@ -309,15 +303,12 @@ def _prove(
         if proposal.dbc is not None:
             shutil.copy(proposal.dbc, folder / proposal.dbc.name)
         car = Vehicle.load(map=folder / "car.toml")
-    if capture is None:
+    if not paths:
         return
-    log = capture_samples(capture, car).as_log()
+    log = capture_samples(paths[0], car).as_log()
     if log is None:
-        raise InputError(
-            "current and voltage found do not make samples: their frames are too far apart",
-            source=capture,
-            cure="choose others by --choose",
-        )
+        problem = "current and voltage found do not make samples: their frames are too far apart"
+        raise InputError(problem, source=paths[0], cure="choose others by --choose")
     sign = sign_of_current(log)
     found = {"sign": sign.sign, "confidence": sign.confidence, "text": sign.strongest.text}
     amps, volts = log.current_a, log.voltage_v
@@ -325,7 +316,7 @@ def _prove(
         turned = [replace(each, sign=-1) for each in proposal.candidates["current"]]
         proposal.candidates["current"] = turned
         amps = -amps
-    proposal.proof |= {
+    proposal.proof = {
         "sign": found,
         "soc": _soc_by_charge(log, sign.sign or 1),
         "samples": len(log),
@@ -363,8 +354,7 @@ def _show_candidates(proposal: Proposal) -> None:
         for number, candidate in enumerate(candidates):
             mark = str(number + 1)
             if proposal.chosen.get(role) == number:
-                is_open = bool(proposal.levels(role)) or not proposal.is_proven(role)
-                mark += " ?" if is_open else " ✓"
+                mark += " ?" if proposal.is_open(role) else " ✓"
             rows.append([mark, *candidate.cells])
         if candidates:
             print_table(role.replace("_reference", ""), ["", *candidates[0].HEAD], rows)
@@ -372,21 +362,19 @@ def _show_candidates(proposal: Proposal) -> None:
         note(f"note: {remark}")
 
 
-def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -> None:
+def _show(proposal: Proposal, files: Sequence[str], output: Path) -> None:
     """Print the candidates, what the capture proves, what is assumed, and the next commands."""
-    from cangauge.extras.discovery.by_name import NamedSignal
     from cangauge.extras.discovery.candidate import range_text
 
     say(f"{proposal.answer}: wrote {', '.join(files)}.")
     _show_candidates(proposal)
-    if proposal.proof:
-        amps, volts = proposal.proof["current_a"], proposal.proof["voltage_v"]
-        shown = f"{range_text(amps[0], amps[1], 'A')}, {range_text(volts[0], volts[1], 'V')}"
-        note(f"decoded: {proposal.proof['samples']} samples of the first capture, {shown}")
+    if proof := proposal.proof:
+        (low_a, high_a), (low_v, high_v) = proof["current_a"], proof["voltage_v"]
+        shown = f"{range_text(low_a, high_a, 'A')}, {range_text(low_v, high_v, 'V')}"
+        note(f"decoded: {proof['samples']} samples of the first capture, {shown}")
     if proposal.method != "physics":
         note(proposal.sign_text)
-    current = proposal.signals.get("current")
-    if isinstance(current, NamedSignal) and current.is_wrapped:
+    if getattr(proposal.signals.get("current"), "is_wrapped", False):
         note("note: the DBC reads negative currents as large ones; the map has signed = true")
     if why := proposal.proof.get("soc", {}).get("why"):
         note(f"SoC: {why}.")
@@ -395,9 +383,10 @@ def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -
             "note: no temperature is clearly the pack's or chosen: the files assume"
             f" {proposal.fixed_c:g} °C; some °C of error are worth several % SoC"
         )
-    for role, cure in _SCALE_CURES.items():
+    for role, (quantity, cure) in _SCALE_CURES.items():
         if levels := proposal.levels(role):
-            quantity = "SoC" if role == "soc_reference" else role
             texts = ", ".join(level.text for level in levels)
             note(f"note: The bits do not tell the scale of the {quantity}: {texts}. {cure}")
-    note(f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading} -o {model}")
+    reading = proposal.reading(output)
+    fitting = f"cangauge fit DRIVE … {reading} -o {output / 'model.json'}"
+    note(f"next: cangauge inspect DRIVE {reading}, then {fitting}")

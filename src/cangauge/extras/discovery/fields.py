@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
 
 import can
@@ -116,6 +116,11 @@ class Place:
             return 8 * (self.first // 8) + 7 - self.first % 8
         return 8 * length - 1 - self.last
 
+    def text(self, length: int) -> str:
+        """Return its bits as in a DBC, such as "7|11@0-"."""
+        order, sign = int(not self.is_motorola), "-" if self.is_signed else "+"
+        return f"{self.start(length)}|{self.width}@{order}{sign}"
+
     def bits(self, length: int) -> frozenset[int]:
         """Return its bits in Motorola's reading order."""
         places = range(self.first, self.last + 1)
@@ -164,27 +169,15 @@ class Field:
         return Statistics.of(self.raw[~self.missing])
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Values of a field in time, with the log prior of a measurement.
+class Statistics(NamedTuple):
+    """Range and number of a field's distinct values, the most common one, and a log prior.
 
-    Parameters
-    ----------
-    low, high, count : float, float, int
-        Range and number of the distinct values.
-    steps, largest_step : int, float
-        Number of changes, and the largest.
-    resting : float
-        Most common value.
-    prior : float
-        Log prior that a measurement moves so [nats].
+    The prior is that a measurement moves so [nats].
     """
 
     low: float
     high: float
-    count: int
-    steps: int
-    largest_step: float
+    distinct: int
     resting: float
     prior: float
 
@@ -192,15 +185,14 @@ class Statistics:
     def of(cls, raw: Ints) -> Statistics:
         """Return those of raw numbers in time."""
         values, change = np.unique(raw), np.diff(raw)
-        steps = int(np.count_nonzero(change))
         count, low, high = len(values), float(values[0]), float(values[-1])
         filled = count / min(high - low + 1.0, len(raw) / 4.0 + 1.0)
-        both_ways = min(int((change > 0).sum()), int((change < 0).sum())) > 2
+        rises, falls = np.count_nonzero(change > 0), np.count_nonzero(change < 0)
         # A measurement moves up and down through neighbouring values; states jump between few.
-        prior = 1.5 if steps >= 8 and count >= 3 and filled > 0.5 and both_ways else 0.0
+        is_moving = rises + falls >= 8 and min(rises, falls) > 2
+        prior = 1.5 if is_moving and count >= 3 and filled > 0.5 else 0.0
         prior -= 2.0 if count < 3 else 1.5 if filled < 0.2 else 0.0
-        largest = float(np.abs(change).max(initial=0))
-        return cls(low, high, count, steps, largest, most_common(raw), prior)
+        return cls(low, high, count, most_common(raw), prior)
 
 
 def most_common(values: Ints) -> float:
@@ -223,7 +215,7 @@ def collect(messages: Iterable[can.Message]) -> list[Stream]:
     streams = []
     for (channel, number, is_extended), all_of_id in frames.items():
         length = int(np.bincount([len(data) for _, data in all_of_id]).argmax())
-        own = sorted((each for each in all_of_id if len(each[1]) == length), key=lambda one: one[0])
+        own = sorted((each for each in all_of_id if len(each[1]) == length), key=itemgetter(0))
         if len(own) >= MIN_FRAMES:
             time_s = np.array([stamp for stamp, _ in own])
             payload = np.frombuffer(b"".join(data for _, data in own), np.uint8)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -19,15 +19,29 @@ from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.discovery.candidate import (
-    CURRENT_SCALES,
     MOST_A,
     MOST_SAG,
     MOVE,
+    ROLES,
+    SHOWN,
     Level,
     SignalCandidate,
+    field_name,
 )
 from cangauge.extras.discovery.fields import Field, Ints, Place, Stream, most_common
 
+CURRENT_SCALES: Final = {
+    0.1: 0.0,
+    0.5: -0.3,
+    0.25: -0.5,
+    0.01: -0.5,
+    0.05: -0.5,
+    1.0: -1.0,
+    0.025: -1.0,
+    0.125: -1.2,
+    0.02: -1.5,
+}
+"""Usual scales [A] and their log priors [nats], by their frequency in public DBC files."""
 MOST_ROWS: Final = 4000
 TREND_S: Final = 10.0
 """Width of the moving average that is taken away [s]: shorter than SoC and temperature move."""
@@ -54,7 +68,6 @@ RESISTANCE_OHM: Final = (0.008, 1.2)
 TYPICAL_OHM: Final = 0.12
 RESISTANCE_SPREAD: Final = 1.2
 """Bounds, median and log spread of a pack's resistance: 12 V starter packs to old car packs."""
-SHOWN: Final = 3
 SATURATION_NATS: Final = 20.0
 """Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
@@ -126,10 +139,10 @@ class Row:
     missing : array (n,) of bool
     prior : float
         Log prior of the field in its role [nats].
-    scale : float
-        Of a voltage [V].
-    others : tuple of Level
-        Other readings of a voltage that fit the stated one as well.
+    scale, volts : float
+        Of a voltage: scale and middle [V].
+    levels : tuple of Level
+        Readings of a voltage that fit the stated one as well as its own, which is the first.
     """
 
     field: Field
@@ -138,7 +151,8 @@ class Row:
     missing: BoolArray
     prior: float = 0.0
     scale: float = 1.0
-    others: tuple[Level, ...] = ()
+    volts: float = math.nan
+    levels: tuple[Level, ...] = ()
 
     @cached_property
     def values(self) -> Ints:
@@ -184,24 +198,28 @@ class Row:
 
     def candidate(self, role: str, scale: float, offset: float, **more: Any) -> SignalCandidate:
         """Return the field as the signal of a role."""
+        stream, place = self.field.stream, self.place
         ends = scale * np.array([self.values.min(), self.values.max()], np.float64) + offset
         code: int | None = None
         gone = self.field.raw[self.field.missing & (self.field.raw != 0)]
         if len(gone):
             codes, counts = np.unique(gone, return_counts=True)
-            is_signed = self.place.is_signed
-            code = int(codes[counts.argmax()]) if is_signed else (1 << self.place.width) - 1
+            code = int(codes[counts.argmax()]) if place.is_signed else (1 << place.width) - 1
         return SignalCandidate(
-            role,
-            self.field.stream,
-            self.place,
-            scale,
-            offset,
-            float(ends.min()),
-            float(ends.max()),
-            self.steps,
-            self.moves,
-            code,
+            role=role,
+            message=f"FRAME_{stream.arbitration_id:X}",
+            signal=ROLES[role].column,
+            unit=ROLES[role].unit,
+            low=float(ends.min()),
+            high=float(ends.max()),
+            period_s=stream.period_s,
+            stream=stream,
+            place=place,
+            scale=scale,
+            offset=offset,
+            steps=self.steps,
+            moves=self.moves,
+            not_available=code,
             **more,
         )
 
@@ -278,11 +296,7 @@ class Pairs:
         # Without evidence the slope is chance and constrains neither scale nor resistance.
         unknown = evidence < 1.0
         likely = np.where(unknown, -1.0, np.maximum(likely, -3.0))
-        guessed = [
-            max(CURRENT_SCALES, key=lambda each: _guess(each, *row))
-            for row in zip(widths, away, strict=True)
-        ]
-        self.current_scale = np.where(unknown, np.array(guessed)[None, :], self.current_scale)
+        self.current_scale = np.where(unknown, _guess(widths, away), self.current_scale)
         middle = [np.median(each, axis=1) for each in level]
         sags = self.slope * away > MOST_SAG * middle[0][:, None]
         is_copy = (np.abs(self.slope * middle[1] / middle[0][:, None] - 1.0) < 0.25) & (
@@ -407,12 +421,14 @@ class Pairs:
         }
         zero = 0.0
         if not i.place.is_signed:
-            zeros = round_zeros(float(i.values.min()), float(i.values.max()), i.place.width)
-            zero = min(zeros or [0.0], key=lambda each: abs(each - most_common(i.values)))
+            ends = float(i.values.min()), float(i.values.max())
+            zeros = np.array(round_zeros(*ends, i.place.width) or [0.0])
+            zero = float(zeros[np.abs(zeros - most_common(i.values)).argmin()])
+        names = [field_name(row.field.stream, row.place) for row in (u, i)]
         sign = 1 if r < 0.0 else -1
-        current = i.candidate("current", amps, -amps * zero, sign=sign, **facts)
-        voltage = u.candidate("voltage", u.scale, 0.0, others=u.others, **facts)
-        return replace(current, partner=voltage.name), replace(voltage, partner=current.name)
+        current = i.candidate("current", amps, -amps * zero, sign=sign, partner=names[0], **facts)
+        more = {"levels": u.levels, "partner": names[1]}
+        return current, u.candidate("voltage", u.scale, 0.0, **more, **facts)
 
     def _halves(self, a: int, b: int) -> list[float]:
         """Return dU/dI by each half of the capture, in raw numbers; discharge gives R > 0."""
@@ -442,11 +458,13 @@ def _narrow(full_a: FloatArray) -> FloatArray:
     return np.where(full_a < 60.0, 3.0, np.where(full_a < 150.0, 1.0, 0.0))
 
 
-def _guess(scale: float, width: int, away: float) -> float:
-    """Return the log prior of a scale [A] for a field of this width and reach, without evidence."""
-    full_a = np.array(scale * 2.0 ** (width - 1))
-    prior = CURRENT_SCALES[scale] - float(_narrow(full_a)) - (1.0 if full_a > 2000.0 else 0.0)
-    return prior + (IMPOSSIBLE if scale * away > MOST_A else 0.0)
+def _guess(widths: Ints, away: FloatArray) -> FloatArray:
+    """Return the likeliest scales [A] of fields of some widths and reaches, without evidence."""
+    scales, usual = np.array([*CURRENT_SCALES.items()]).T[:, :, None]
+    full_a = scales * 2.0 ** (widths - 1)
+    prior = usual - _narrow(full_a) - (full_a > 2000.0)
+    prior = np.where(scales * away > MOST_A, prior + IMPOSSIBLE, prior)
+    return np.asarray(scales[prior.argmax(0), 0])
 
 
 def _are_siblings(one: SignalCandidate, two: SignalCandidate) -> bool:

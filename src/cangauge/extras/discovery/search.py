@@ -7,9 +7,10 @@ what falls with the charge of that current.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from operator import attrgetter
 from typing import Final
 
 import can
@@ -21,8 +22,7 @@ from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import (
     LEAST_HOURS,
     MOVES,
-    SOC_SCALES,
-    VOLTAGE_SCALES,
+    SHOWN,
     Level,
     SignalCandidate,
     is_capacity,
@@ -31,13 +31,28 @@ from cangauge.extras.discovery.fields import Field, Stream, collect, fields_of
 from cangauge.extras.discovery.pairs import (
     IMPOSSIBLE,
     LARGEST_R2,
-    SHOWN,
     Grid,
     Pairs,
     Row,
     round_zeros,
 )
 
+VOLTAGE_SCALES: Final = {
+    0.1: 0.0,
+    0.5: -0.3,
+    0.25: -0.3,
+    0.01: -0.3,
+    0.125: -1.2,
+    0.05: -2.0,
+    0.02: -2.0,
+    1.0: -1.0,
+    2.0: -3.0,
+}
+"""Usual scales [V] and their log priors [nats], by their frequency in public DBC files."""
+SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
+"""Usual scales of a SoC [%]."""
+NOMINAL_CELL_V: Final = 3.7
+"""Nominal voltage of an oxide cell [V], to count the cells that a scale implies."""
 BETWEEN_S: Final = 10.0
 """Pause that is put between captures [s]: as long as trends that the search takes away."""
 GRID_S: Final = 0.1
@@ -105,6 +120,12 @@ class Findings:
         """Whether a voltage follows steps of a current."""
         return any(each.evidence >= ENOUGH_NATS and each.moves >= MOVES for each in self.current)
 
+    @property
+    def clear(self) -> list[str]:
+        """Roles whose first candidate is taken without the user; a SoC that falls always is."""
+        pair = [role for role in ("current", "voltage") if self.is_clear(role)]
+        return [*pair, "soc_reference"] if self.soc_reference else pair
+
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
         found: Candidates = getattr(self, role)
@@ -166,10 +187,40 @@ def _pair(
     if not currents or not voltages:
         return [], [], None
     # All pairs are held in memory: of the largest buses, the likelier fields.
-    currents = sorted(currents, key=lambda row: -row.prior)[:MOST_CURRENTS]
-    voltages = sorted(voltages, key=lambda row: -row.prior)[:MOST_VOLTAGES]
+    currents = sorted(currents, key=attrgetter("prior"), reverse=True)[:MOST_CURRENTS]
+    voltages = sorted(voltages, key=attrgetter("prior"), reverse=True)[:MOST_VOLTAGES]
     current, voltage, row = Pairs(voltages, currents, grid).best()
+    if nominal_v is None:
+        voltage = [_with_levels(each, _voltage_levels(each)) for each in voltage]
     return ([], [], None) if row is None else (current, voltage, row)
+
+
+def _with_levels(one: SignalCandidate, levels: Iterable[Level]) -> SignalCandidate:
+    """Return a candidate with the readings by usual scales, its own first, if there are others."""
+    ordered = sorted(levels)
+    own = [each for each in ordered if each.scale == one.scale]
+    others = [each for each in ordered if each.scale != one.scale]
+    return replace(one, levels=(*own, *others) if others else ())
+
+
+def _voltage_levels(one: SignalCandidate) -> Iterator[Level]:
+    """Yield what usual scales of a voltage mean: bits and physics are the same by every scale."""
+    for scale in VOLTAGE_SCALES:
+        volts = scale * (one.low + one.high) / 2.0 / one.scale
+        text = f"{volts:.3g} V at {scale:g} V a step"
+        if scale == one.scale or 30.0 < volts < 1000.0:
+            cells = round(volts / NOMINAL_CELL_V)
+            yield Level(scale, volts, f"{text} (about {cells} cells)")
+
+
+def _soc_levels(one: SignalCandidate) -> Iterator[Level]:
+    """Yield what usual scales of a SoC mean."""
+    for scale in SOC_SCALES:
+        low, high = (end * scale / one.scale for end in (one.low, one.high))
+        capacity_ah = one.capacity_ah * one.scale / scale
+        if scale == one.scale or (high <= 100.0 and is_capacity(capacity_ah)):
+            ends = f"{low:.3g} … {high:.3g} %"
+            yield Level(scale, high, f"{ends} at {scale:g} % a step ({capacity_ah:.0f} Ah)")
 
 
 def _socs(
@@ -185,7 +236,9 @@ def _socs(
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
     least_ah = LEAST_HOURS * float(np.abs(amps).max())
     found = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
-    possible = [each for each in found if each.capacity_ah >= least_ah]
+    possible = [
+        _with_levels(each, _soc_levels(each)) for each in found if each.capacity_ah >= least_ah
+    ]
     return _apart(possible, current.bits | voltage.bits)
 
 
@@ -194,7 +247,7 @@ def _as_current(field: Field) -> Row | None:
     seen = field.statistics
     place, nature, constant = field.best
     is_signed, full = place.is_signed, 1 << place.width
-    if seen.count < 3 and not is_signed:
+    if seen.distinct < 3 and not is_signed:
         return None
     prior = nature + _rate_prior(field.stream) + seen.prior
     low, high = seen.low + constant, seen.high + constant
@@ -220,7 +273,7 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
     if field.best.place.is_signed:
         return None
     zero = (field.raw == 0) & ~field.missing
-    readings: list[tuple[Row, float]] = []
+    readings: list[Row] = []
     for place, nature, constant in field.extents:
         # Zero: before the contactors close.
         missing = field.missing | zero if constant == 0 else field.missing
@@ -237,22 +290,31 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
         prior -= AT_HALF_NATS if at_half else 0.0
         for scale in VOLTAGE_SCALES:
             likely = _scale_prior(scale, level * scale, place.width, nominal_v)
-            row = Row(field, place, constant, missing, prior + likely, scale)
-            readings.append((row, level * scale))
+            volts = level * scale
+            readings.append(Row(field, place, constant, missing, prior + likely, scale, volts))
     return _likeliest(readings, nominal_v)
 
 
-def _likeliest(readings: Sequence[tuple[Row, float]], nominal_v: float | None) -> Row | None:
+def _likeliest(readings: Sequence[Row], nominal_v: float | None) -> Row | None:
     """Return the likeliest reading, with the others that fit a stated voltage as well."""
-    best, best_v = max(readings, key=lambda each: each[0].prior, default=(None, 0.0))
+    best = max(readings, key=attrgetter("prior"), default=None)
     if best is None or best.prior < IMPOSSIBLE / 2.0:
         return None
-    for row, volts in readings if nominal_v else ():
-        near = abs(math.log(volts / (nominal_v or volts))) < 2.0 * NOMINAL_SPREAD
-        if near and abs(volts / best_v - 1.0) > ALIKE and row.prior > best.prior - UNLIKELY:
-            text = f"{volts:.3g} V at {row.scale:g} V a step of {row.place.width} bits"
-            best.others += (Level(row.scale, volts, text),)
+    others = [
+        _level(row)
+        for row in (readings if nominal_v else ())
+        if abs(math.log(row.volts / (nominal_v or 1.0))) < 2.0 * NOMINAL_SPREAD
+        and abs(row.volts / best.volts - 1.0) > ALIKE
+        and row.prior > best.prior - UNLIKELY
+    ]
+    if others:
+        best.levels = (_level(best), *others)
     return best
+
+
+def _level(row: Row) -> Level:
+    text = f"{row.volts:.3g} V at {row.scale:g} V a step of {row.place.width} bits"
+    return Level(row.scale, row.volts, text)
 
 
 def _as_charge(
@@ -260,7 +322,7 @@ def _as_charge(
 ) -> SignalCandidate | None:
     """Return a field as a SoC, if it falls as the charge is drawn."""
     seen = field.statistics
-    if field.best.place.is_signed or seen.count < 4:
+    if field.best.place.is_signed or seen.distinct < 4:
         return None
     values = grid.means(field.stream, field.raw, field.missing)[span]
     spread, moved = float(np.std(values)), float(np.std(drawn_ah))
@@ -269,7 +331,7 @@ def _as_charge(
     r = float(np.mean((values - values.mean()) * (drawn_ah - drawn_ah.mean()))) / (spread * moved)
     if r > -0.95:
         return None
-    evidence = -0.5 * seen.count * math.log(1.0 - min(r * r, LARGEST_R2))
+    evidence = -0.5 * seen.distinct * math.log(1.0 - min(r * r, LARGEST_R2))
     best: SignalCandidate | None = None
     for place, nature, constant in field.extents:
         row = Row(field, place, constant, field.missing)
@@ -334,7 +396,7 @@ def _full_scale_prior(scale: float, width: int) -> float:
 def _apart(found: Candidates, taken: frozenset[tuple[int, bool, int]]) -> Candidates:
     """Return the best candidates, without those that share bits with a better one."""
     kept: Candidates = []
-    for each in sorted(found, key=lambda one: -one.score):
+    for each in sorted(found, key=attrgetter("score"), reverse=True):
         if not each.bits & taken:
             kept.append(each)
             taken |= each.bits
