@@ -14,12 +14,7 @@ from cangauge._files import text_sha256
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError, require_choice, require_number
-from cangauge.identify.effect_search import (
-    Search,
-    Selected,
-    linearize,
-    parse_effect_ids,
-)
+from cangauge.identify.effect_search import Search, Selected, linearize, parse_effect_ids
 from cangauge.identify.identification import (
     Identification,
     energy_balance,
@@ -39,10 +34,7 @@ from cangauge.identify.least_squares import (
     row_features,
     solve_scaled,
 )
-from cangauge.identify.published import (
-    PublishedEquation,
-    PublishedFit,
-)
+from cangauge.identify.published import PublishedEquation, PublishedFit
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts
 from cangauge.logs.charge import refuse_contradictions
@@ -52,13 +44,7 @@ from cangauge.model.coulomb_counting import capacity_from_full_discharge, capaci
 from cangauge.model.effects.base import Effect, Values
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import (
-    FunctionFields,
-    Information,
-    Made,
-    Model,
-    SourceLog,
-)
+from cangauge.model.model_file import FunctionFields, Information, Made, Model, SourceLog
 from cangauge.model.noise import Noise
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior
 from cangauge.model.voltage_model import KNOTS_PCT, Ranges
@@ -67,7 +53,6 @@ Equation = Literal["knots", "published"]
 
 RELINEARIZED: Final = 4
 """Linearizations about the fitted effects: products of effects and resistances have converged."""
-
 
 CELLS_TOLERANCE: Final = 0.1
 """Voltage of a cell relative to the nearer typical one, from which the number of cells must be
@@ -149,19 +134,7 @@ def fit(
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
     stated_pct = given_starts(initial_soc_pct, len(recorded))
-    if capacity_ah is None:
-        capacity_ah = capacity_from_full_discharge(recorded, stated_pct)
-    elif isinstance(capacity_ah, str):
-        capacity_ah = capacity_from_reference(recorded)
-    if not capacity_ah > 0.0:
-        raise InputError(
-            "the capacity must be positive",
-            field="capacity_ah",
-            value=capacity_ah,
-            cure="check the sign of current: positive must discharge",
-        )
-    unstated = [log for log, start in zip(recorded, stated_pct, strict=True) if start is None]
-    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
+    capacity_ah = _capacity_of(recorded, stated_pct, capacity_ah)
     effect_ids = _effect_ids(effects, equation)
     chemistry, remark = _chemistry_of(recorded, stated_pct, chemistry, cells, capacity_ah)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
@@ -243,6 +216,28 @@ def _check_logs(logs: Sequence[Log]) -> None:
             cure="state it in a column temperature_source of the logs that do not, or fit logs of"
             " one source together",
         )
+
+
+def _capacity_of(
+    logs: Sequence[Log], starts_pct: Sequence[float | None], stated: float | str | None
+) -> float:
+    """Return the capacity: stated, from a full discharge, or from the logs' own SoC [Ah]."""
+    if stated is None:
+        capacity_ah = capacity_from_full_discharge(logs, starts_pct)
+    elif isinstance(stated, str):
+        capacity_ah = capacity_from_reference(logs)
+    else:
+        capacity_ah = stated
+    if not capacity_ah > 0.0:
+        raise InputError(
+            "the capacity must be positive",
+            field="capacity_ah",
+            value=capacity_ah,
+            cure="check the sign of current: positive must discharge",
+        )
+    unstated = [log for log, start in zip(logs, starts_pct, strict=True) if start is None]
+    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
+    return capacity_ah
 
 
 def _effect_ids(effects: str | Sequence[str] | None, equation: Equation) -> tuple[str, ...]:

@@ -44,11 +44,7 @@ def soc_at_first_row(log: Log, capacity_ah: float) -> float | None:
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
     """
-    start = log.first_soc()
-    if start is None:
-        return None
-    row, soc_pct = start
-    return soc_pct + 100.0 * float(discharged_ah(log.time_s, log.current_a)[row]) / capacity_ah
+    return None if log.first_soc() is None else float(counted_soc_pct(log, capacity_ah)[0])
 
 
 def counted_soc_pct(log: Log, capacity_ah: float) -> FloatArray:
