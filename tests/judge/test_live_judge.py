@@ -30,7 +30,7 @@ DAY_S = 86400.0
 JUDGE = (sys.executable, "-m", "cangauge", "judge", "-m", str(leaf_model_path()))
 OPINION = {
     "now": {"verdict": "agrees", "error_pct": 0.4, "sigma_pct": 1.0},
-    "text": "The gauge is right now: +0.4 ± 1.0 % SoC.\nNothing to do.",
+    "text": "The gauge is right: its error is +0.4 ± 1.0 % SoC now.\nNothing to do.",
 }
 
 

@@ -30,7 +30,7 @@ FAULT = {fault.name: fault for fault in FAULTS}
 def drive() -> PlayedDrive:
     log = synthetic_log(hours=0.15, rate_hz=1.0, start_pct=80.0, end_pct=70.0, noise_v=0.3)
     assert log.soc_pct is not None
-    return PlayedDrive("drive", log, log.soc_pct, leaf_model())
+    return PlayedDrive(log, log.soc_pct, leaf_model())
 
 
 def test_a_counter_has_the_errors_of_its_faults(drive: PlayedDrive) -> None:

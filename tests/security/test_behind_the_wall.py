@@ -90,7 +90,7 @@ def test_a_flood_on_the_batterys_bus_does_not_stop_the_inverters(
 def drive() -> PlayedDrive:
     log = synthetic_log(hours=0.02, rate_hz=1.0, start_pct=80.0, end_pct=79.0)
     assert log.soc_pct is not None
-    return PlayedDrive("drive", log, log.soc_pct, leaf_model())
+    return PlayedDrive(log, log.soc_pct, leaf_model())
 
 
 GAUGE = """

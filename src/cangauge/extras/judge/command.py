@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -114,7 +113,6 @@ def judge_command(
     port={port} -m {model} --initial-soc {soc} --time-source replay-clock`
     """
     from cangauge.extras.judge.judgement import judge, narrowed
-    from cangauge.logs.charge import refuse_contradictions
     from cangauge.model.model_file import Model
 
     if suite:
@@ -127,7 +125,6 @@ def judge_command(
     with progress() as show:
         loaded = reading.load_all(paths, show)
     pack = None if model is None else Model.load(model)
-    refuse_contradictions(loaded, pack.capacity_ah if pack and not capacity_ah else capacity_ah)
     judgement = judge(
         loaded,
         pack,
@@ -193,7 +190,7 @@ def _suite(
     result = {
         "schema": 1,
         "gauge": " ".join(started_by),
-        "scores": [asdict(each) for each in scores],
+        "scores": [score._asdict() for score in scores],
     }
     show = partial(print_table, f"{len(drives)} drives", head, rows)
     finish(result, show, as_json=json_output)

@@ -7,15 +7,16 @@ still while charge moves. Between two cuts lies a piece.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.logs.log import Log
 
 COARSE_PCT: Final = 0.2
-"""Resolution from which y is used only at the rows that `counts` selects [%]."""
+"""Resolution from which y is used only at the rows that `_counts` selects [%]."""
 LIMIT_PCT: Final = 0.05
 """A published SoC as close to 0 or 100 % is a limit [%]."""
 JUMP_PCT: Final = 1.0
@@ -30,17 +31,6 @@ WINDOW_S: Final = 30.0
 """Windows whose medians are searched for jumps [s]."""
 
 
-class Stand(NamedTuple):
-    """A published SoC that stands still while charge moves."""
-
-    first: int
-    last: int
-    """Its rows."""
-    shown_pct: float
-    moved_pct: float
-    """Charge that moved, in either direction [%]."""
-
-
 class GaugeRecord(NamedTuple):
     """What a gauge published; arrays of shape (rows,)."""
 
@@ -48,13 +38,17 @@ class GaugeRecord(NamedTuple):
     """y [%]; NaN where there is none."""
     count_pct: FloatArray
     """y + Q where y is a count [%]; NaN elsewhere."""
-    piece: IntArray
-    """Number of the piece, from 0; −1 outside."""
-    stands: list[Stand]
-    held_pct: float
-    """Charge that moved at the end while y did not [%]."""
-    step_pct: float
+    is_cut: BoolArray
+    """Whether another piece begins."""
+    held_pct: FloatArray
+    """Charge that moves while y is held [%]; at a limit, away from it."""
+    step_pct: FloatArray
     """Resolution [%]."""
+
+    @property
+    def stands(self) -> BoolArray:
+        """Whether y stands still."""
+        return self.held_pct >= STAND_PCT + 2.0 * self.step_pct
 
 
 def published_pct(log: Log) -> FloatArray:
@@ -69,63 +63,53 @@ def resolution_pct(log: Log) -> float:
     return float(np.quantile(np.diff(values), 0.1)) if values.size > 1 else 1.0
 
 
-def read_published(
-    time_s: FloatArray, shown_pct: FloatArray, drawn_pct: FloatArray, step_pct: float
-) -> GaugeRecord:
+def is_limit(shown_pct: FloatArray | float) -> BoolArray:
+    """Return whether a published SoC is a limit."""
+    return np.minimum(np.abs(shown_pct), np.abs(np.subtract(shown_pct, 100.0))) <= LIMIT_PCT
+
+
+def read_published(log: Log, drawn_pct: FloatArray, step_pct: float) -> GaugeRecord:
     """Cut what a gauge published into pieces.
 
     Parameters
     ----------
-    time_s, shown_pct, drawn_pct : array of shape (rows,)
-        Stamps [s], y [%] and Q [%].
+    log : Log
+        A stretch of uninterrupted samples.
+    drawn_pct : array of shape (rows,)
+        Q [%].
     step_pct : float
         Resolution of y [%].
     """
-    held = _held(shown_pct, drawn_pct)
-    stands = [each for each in held if each.moved_pct >= STAND_PCT + 2.0 * step_pct]
-    moving = shown_pct.copy()
-    for stand in stands:
-        moving[stand.first : stand.last + 1] = np.nan
-    limited = is_limit(shown_pct)
-    count = _counts(np.where(limited, np.nan, moving), drawn_pct, step_pct) + drawn_pct
-    cut = np.zeros(len(count), dtype=bool)
-    for row in _jumps(time_s, count, shown_pct, step_pct):
-        cut[row] = True
+    shown = published_pct(log)
+    nothing = np.full_like(shown, np.nan)
+    steps = np.full_like(shown, step_pct)
+    found = GaugeRecord(
+        shown, nothing, np.zeros(len(log), dtype=bool), _held(shown, drawn_pct), steps
+    )
+    is_blank = found.stands | is_limit(shown)
+    count = _counts(np.where(is_blank, np.nan, shown), drawn_pct, step_pct) + drawn_pct
+    found.is_cut[_jumps(log.time_s, count, shown, step_pct)] = True
     # A count that goes on after a stand or a limit as it would have without is the same piece.
-    blank = np.isnan(count) & (limited | np.isnan(moving))
-    known = np.flatnonzero(np.isfinite(count))
-    least = max(JUMP_PCT, 2.0 * step_pct)
-    for k in np.flatnonzero(np.diff(known) > 1):
-        before, after = known[k], known[k + 1]
-        if blank[before + 1 : after].any():
-            cut[after] |= abs(count[after] - count[before]) >= least
-    piece = np.where(np.isfinite(count), np.cumsum(cut), -1)
-    held_pct = held[-1].moved_pct if held else 0.0
-    return GaugeRecord(shown_pct, count, piece, stands, held_pct, step_pct)
+    for before, after in pairwise(np.flatnonzero(np.isfinite(count))):
+        if is_blank[before + 1 : after].any():
+            least = max(JUMP_PCT, 2.0 * step_pct)
+            found.is_cut[after] |= abs(count[after] - count[before]) >= least
+    return found._replace(count_pct=count)
 
 
-def is_limit(shown_pct: FloatArray) -> BoolArray:
-    """Return whether a published SoC is a limit."""
-    return (np.abs(shown_pct) <= LIMIT_PCT) | (np.abs(shown_pct - 100.0) <= LIMIT_PCT)
-
-
-def _held(shown: FloatArray, drawn: FloatArray) -> list[Stand]:
-    """Return where each value is held, and the charge that moves; at a limit, away from it."""
-    known = np.flatnonzero(np.isfinite(shown))
-    if not known.size:
-        return []
-    value, charge = shown[known], drawn[known]
-    first = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
-    result = []
-    for low, high in zip(first, [*first[1:], len(value)], strict=True):
-        part = charge[low:high]
-        moved = float(np.ptp(part))
-        if value[low] <= LIMIT_PCT:
-            moved = float(np.max(np.maximum.accumulate(part) - part))
-        elif value[low] >= 100.0 - LIMIT_PCT:
-            moved = float(np.max(part - np.minimum.accumulate(part)))
-        result.append(Stand(int(known[low]), int(known[high - 1]), float(value[low]), moved))
-    return result
+def _held(shown: FloatArray, drawn: FloatArray) -> FloatArray:
+    """Return the charge that moves while a value is held; at a limit, away from it."""
+    held, known = np.zeros_like(shown), np.flatnonzero(np.isfinite(shown))
+    edges = np.flatnonzero(np.diff(shown[known], prepend=np.nan, append=np.nan) != 0.0)
+    for low, high in pairwise(edges):
+        value, charge = shown[known[low]], drawn[known[low:high]]
+        moved = np.ptp(charge)
+        if value <= LIMIT_PCT:
+            moved = np.max(np.maximum.accumulate(charge) - charge)
+        elif value >= 100.0 - LIMIT_PCT:
+            moved = np.max(charge - np.minimum.accumulate(charge))
+        held[known[low] : known[high - 1] + 1] = moved
+    return held
 
 
 def _counts(shown: FloatArray, drawn: FloatArray, step_pct: float) -> FloatArray:
@@ -155,41 +139,31 @@ def _counts(shown: FloatArray, drawn: FloatArray, step_pct: float) -> FloatArray
 def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, step_pct: float) -> list[int]:
     """Return the rows at which the count has jumped; the rows within a jump become NaN."""
     known = np.flatnonzero(np.isfinite(count))
-    if known.size < 3:
+    window = np.floor((time_s[known] - time_s[known[:1]]) / WINDOW_S)
+    first = np.flatnonzero(np.diff(window, prepend=-1.0))
+    if first.size < 3:
         return []
-    window = np.floor((time_s[known] - time_s[known[0]]) / WINDOW_S)
-    first = known[np.flatnonzero(np.diff(window, prepend=-1.0))]
     level, value = (
-        np.array([np.median(part) for part in np.split(of[known], _places(window))])
+        np.array([np.median(part) for part in np.split(of[known], first[1:])])
         for of in (count, shown)
     )
-    if level.size < 3:
-        return []
     # Over two windows, so that a jump of a minute counts whole.
     change = level[2:] - level[:-2]
-    moved = value[2:] - value[:-2]
-    one = np.diff(level)
-    least = max(JUMP_PCT, 2.0 * step_pct, SEVERAL * float(np.quantile(np.abs(one), 0.9)))
-    result, after = list[int](), -1
-    large = np.minimum(np.abs(change), np.abs(moved)) >= least
-    if np.count_nonzero(large[1:] & ~large[:-1]) > MOST_JUMPS:
+    usual = float(np.quantile(np.abs(np.diff(level)), 0.9))
+    least = max(JUMP_PCT, 2.0 * step_pct, SEVERAL * usual)
+    is_large = np.minimum(np.abs(change), np.abs(value[2:] - value[:-2])) >= least
+    if np.count_nonzero(is_large[1:] & ~is_large[:-1]) > MOST_JUMPS:
         return []
-    for k in np.flatnonzero(large):
-        near = slice(max(0, int(k) - 1), int(k) + 2)
-        if k <= after or np.abs(change[k]) < np.abs(change[near]).max():
+    result, after = list[int](), -1
+    for k in np.flatnonzero(is_large).tolist():
+        near = np.abs(change[max(0, k - 1) : k + 2])
+        if k <= after or abs(change[k]) < near.max():
             continue
-        low, high = first[k] + 1, first[k + 2]
-        half = 0.5 * (level[k] + level[k + 2])
-        inside = known[(known >= low) & (known <= high)]
-        beyond = (count[inside] - half) * np.sign(change[k]) > 0.0
-        row = int(inside[int(np.argmax(beyond))]) if beyond.any() else int(high)
+        inside = known[first[k] + 1 : first[k + 2] + 1]
+        beyond = (count[inside] - 0.5 * (level[k] + level[k + 2])) * np.sign(change[k]) > 0.0
+        row = inside[np.argmax(beyond)] if beyond.any() else inside[-1]
         ends = np.abs(count[inside] - np.where(inside < row, level[k], level[k + 2]))
         count[inside[ends > 0.25 * abs(change[k])]] = np.nan
-        result.append(row if np.isfinite(count[row]) else int(high))
-        after = int(k) + 1
+        result.append(int(row if np.isfinite(count[row]) else inside[-1]))
+        after = k + 1
     return result
-
-
-def _places(numbers: FloatArray) -> IntArray:
-    """Return where another number begins."""
-    return np.flatnonzero(np.diff(numbers)) + 1

@@ -1,34 +1,28 @@
-"""The judgement on a gauge: how far off now and before, why, and what to do next."""
+"""The judgement on a gauge: how far off now and before, and why."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from itertools import pairwise
+from typing import Any, Final
 
 import numpy as np
-from scipy.special import expit, ndtr
+from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from cangauge._text import number
+from cangauge._text import number, rounded
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.checks import check_given_once
 from cangauge.errors import InputError
-from cangauge.extras.judge.chain import SHORTEST_S, Chain, Stretch
-from cangauge.extras.judge.faults import BEYOND, P_FAULT, Fitted, Priors, Term, explain
+from cangauge.extras.judge.chain import Chain
+from cangauge.extras.judge.explain import BEYOND, Fitted, explain
+from cangauge.extras.judge.faults import FAULTS, Column, Priors
 from cangauge.extras.judge.gauge import JUMP_PCT, is_limit, published_pct
-from cangauge.extras.judge.result import (
-    OFF_PCT,
-    SURE,
-    FoundFault,
-    Judgement,
-    Moment,
-    Piece,
-    Verdict,
-    is_dated,
-)
+from cangauge.extras.judge.result import FoundFault, Judgement, Moment, Piece, Verdict, is_dated
+from cangauge.extras.judge.text import OFF_PCT, SURE
 from cangauge.extras.judge.weak import CURVE_PCT, WeakestCell, weak_cell
-from cangauge.logs.gaps import discharged_ah
+from cangauge.logs.charge import implied_capacity
 from cangauge.logs.log import Log, as_log
 from cangauge.logs.read import CellColumns
 from cangauge.model.model_file import PRIOR_MADE_BY, FunctionFields, Model, as_model
@@ -43,21 +37,20 @@ NAMED: Final = 0.9
 """A fault is named from this probability, …"""
 MATERIAL_PCT: Final = 2.0
 """… where it moves the published SoC by this somewhere: less is the gauge's resolution."""
-CONTRADICTION: Final = 2.0
-"""Where charge and published SoC differ by this factor, one of the two is no such signal."""
-LEAST_MOVED_PCT: Final = 3.0
-"""Least movement of both from which that can be seen [%]."""
-FITTED: Final = (1.5, 0.75, 0.25)
-"""Standard deviations of a fitted model's capacity [%], of the gauge's zero beside it [%], half of
-that of a full charge, since both call much the same full, and of the voltage sensor, its class
-[%]."""
-TYPICAL: Final = (3.0, 5.0, 5.0)
-"""The same of a typical cell with a stated capacity. A car shows the usable part of its cells,
-which leaves up to a tenth of the charge at either end; cells of one chemistry differ by 5 %."""
+FITTED: Final = Priors(1.5, 0.75, 0.25)
+"""With a fitted model. The zero is half of the σ of a full charge, since both call much the same
+full; the voltage is that of the sensor's class."""
+TYPICAL: Final = Priors(3.0, 5.0, 5.0)
+"""With a typical cell and a stated capacity. A car shows the usable part of its cells, which leaves
+up to a tenth of the charge at either end; cells of one chemistry differ by 5 %."""
 LFP_ZERO_PCT: Final = 0.5
 """Zero of a gauge of LFP cells, which is set to 100 % at the end of a charge [%]."""
 COUNTED_STD_PCT: Final = 10.0
 """Standard deviation of a capacity that only the gauge's own count states [%]."""
+CONTRADICTION: Final = 3.0
+"""Where charge and published SoC differ by this factor, one of the two is no such signal."""
+PROPORTIONAL: Final = 0.8
+"""Square of the correlation from which they are in proportion."""
 MISFIT_V: Final = 0.1
 """Without a model: mean error of the voltage at the best start that no cell of the chemistry has
 [V per cell]."""
@@ -97,7 +90,8 @@ def judge(
     ------
     InputError
         If no log has a published SoC, a log is given twice, neither model nor chemistry and cells
-        are given, or the voltage is not that of such cells.
+        are given, the voltage is not that of such cells, or charge and published SoC contradict
+        each other by a factor of two.
     """
     judged = tuple(as_log(log) for log in logs)
     if is_dated(judged):
@@ -110,13 +104,15 @@ def judge(
             cure="name its column, such as --columns soc=HEADING",
         )
     if model is not None:
-        pack, stds = as_model(model), FITTED
+        pack, priors = as_model(model), FITTED
         if capacity_ah is not None:
             pack = pack.model_copy(update={"capacity_ah": capacity_ah})
     elif chemistry is not None and cells is not None:
-        stds = TYPICAL if chemistry == "oxide" else (TYPICAL[0], LFP_ZERO_PCT, TYPICAL[2])
-        stds = stds if capacity_ah is not None else (COUNTED_STD_PCT, *stds[1:])
-        pack = Model.prior(chemistry, cells, capacity_ah or _capacity_ah(judged))
+        priors = TYPICAL if chemistry == "oxide" else TYPICAL._replace(zero_pct=LFP_ZERO_PCT)
+        if capacity_ah is None:
+            priors = priors._replace(capacity_pct=COUNTED_STD_PCT)
+            capacity_ah = implied_capacity(judged).capacity_ah
+        pack = Model.prior(chemistry, cells, capacity_ah)
     else:
         raise InputError(
             "neither a model nor chemistry and cells",
@@ -124,255 +120,184 @@ def judge(
             cure="give -m MODEL, or --chemistry oxide|lfp and --cells N",
         )
     with threadpool_limits(1):  # small matrices
-        chain = Chain.of(judged, pack)
-        if not any(np.isfinite(part.published.shown_pct).any() for part in chain.stretches):
-            raise InputError(
-                "no stretch of samples is long enough",
-                cure=f"give logs of at least {SHORTEST_S / 60.0:.0f} minutes, better half an hour"
-                " with changing load",
-            )
-        if pack.made.by == PRIOR_MADE_BY:
-            _check_cells(chain, pack)
-        fits = explain(chain, Priors(pack.capacity_ah, *stds))
-    weakest = _weakest(judged, cell_voltages, pack, chain, fits)
-    return _judgement(judged, pack, chain, fits, weakest)
+        chain = Chain(judged, pack)
+        _check(chain)
+        fits = explain(chain, priors)
+    weakest = _weakest(judged, cell_voltages, chain, fits[0].pack_pct)
+    return _judgement(judged, chain, fits, weakest)
 
 
-def _capacity_ah(logs: Sequence[Log]) -> float:
-    """Return the charge per 100 % of the gauge's own count [Ah]."""
-    covariance = variance = 0.0
-    for log in logs:
-        known = np.isfinite(published_pct(log))
-        if known.any():
-            drawn_ah = discharged_ah(log.time_s, log.current_a)[known]
-            soc = published_pct(log)[known]
-            covariance -= float(np.sum((soc - soc.mean()) * (drawn_ah - drawn_ah.mean())))
-            variance += float(np.sum((soc - soc.mean()) ** 2))
-    if covariance <= 0.0:
+def _check(chain: Chain) -> None:
+    """Raise InputError for a current or SoC that is no such signal, and for other cells."""
+    ratio = _ratio(chain)
+    if not 1.0 / CONTRADICTION < abs(ratio) < CONTRADICTION:
         raise InputError(
-            "the capacity does not follow from the logs: the published SoC hardly changes",
-            field="--capacity-ah",
-            cure="give the pack's capacity",
+            "charge and SoC contradict each other: one moves by"
+            f" {rounded(max(abs(ratio), 1.0 / max(abs(ratio), 1e-9)))} times the other",
+            field="current_a",
+            cure="check unit, scale, sign and width of the current and of the SoC",
         )
-    return 100.0 * covariance / variance
-
-
-def _check_cells(chain: Chain, typical: Model) -> None:
-    """Raise InputError if the voltage is not that of typical cells at any SoC."""
-    cells = typical.cells or 1
-    misfit_v = float(np.median([part.misfit_v for part in chain.stretches])) / cells
-    if abs(misfit_v) > MISFIT_V:
+    if chain.model.made.by != PRIOR_MADE_BY:
+        return
+    cells = chain.model.cells or 1
+    error_v = chain.blocks.voltage_v - chain.voltage_v(chain.fitting_pct)
+    misfit_v = float(np.median([np.nanmean(error_v[each.blocks]) for each in chain.stretches]))
+    if abs(misfit_v) > MISFIT_V * cells:
         raise InputError(
-            f"at no SoC is the voltage that of {cells} {typical.chemistry} cells: the best start"
-            f" leaves {number(misfit_v, 2, 'V')} per cell",
+            f"at no SoC is the voltage that of {cells} {chain.model.chemistry} cells: the best"
+            f" start leaves {number(misfit_v / cells, 2, 'V')} per cell",
             field="--chemistry/--cells",
             cure="check --chemistry and --cells, or fit a model of the pack",
         )
 
 
+def _ratio(chain: Chain) -> float:
+    """Return charge over what the published SoC moves by, if one follows the other; else 1.
+
+    A signal that is decoded wrongly is in proportion. A gauge that jumps, stands still or follows
+    the voltage is not.
+    """
+    sums = np.zeros((2, 2))
+    for stretch in chain.stretches:
+        shown = chain.published.shown_pct[stretch.samples]
+        both = np.array([shown, -chain.samples.drawn_pct[stretch.samples]])[:, np.isfinite(shown)]
+        if both.size:
+            apart = both - both.mean(axis=1, keepdims=True)
+            sums += apart @ apart.T
+    in_proportion = sums[0, 1] ** 2 > PROPORTIONAL * sums[0, 0] * sums[1, 1]
+    return float(sums[0, 1] / sums[0, 0]) if in_proportion else 1.0
+
+
 def _weakest(
     logs: Sequence[Log],
     cell_voltages: Sequence[CellColumns | None],
-    model: Model,
     chain: Chain,
-    fits: Sequence[Fitted],
+    soc_pct: FloatArray,
 ) -> WeakestCell | None:
     """Return the weakest cell where it is one more probably than not."""
-    volts, socs, amps, first, cells = [], [], [], 1, 1
-    for part, soc_pct in zip(chain.stretches, fits[0].pack_pct, strict=True):
-        beside = cell_voltages[part.log] if part.log < len(cell_voltages) else None
+    volts, socs, amps, first = [], [], [], 1
+    for stretch in chain.stretches:
+        beside = cell_voltages[stretch.log] if stretch.log < len(cell_voltages) else None
         if beside is None:
             continue
-        rows = np.searchsorted(logs[part.log].time_s, part.time_s)
-        first, cells = beside.first, beside.count
+        log, first = logs[stretch.log], beside.first
+        rows = np.searchsorted(log.time_s, chain.blocks.time_s[stretch.blocks])
         volts.append(beside.voltage_v[rows])
-        socs.append(soc_pct)
-        amps.append(logs[part.log].current_a[rows])
+        socs.append(soc_pct[stretch.blocks])
+        amps.append(log.current_a[rows])
     if not volts:
         return None
-    curve_v = model.voltage_model().pseudo_ocv(CURVE_PCT) / cells
+    curve_v = chain.model.voltage_model().pseudo_ocv(CURVE_PCT) / volts[0].shape[1]
     weakest = weak_cell(volts, socs, amps, curve_v, first)
-    return weakest if weakest is not None and _p_weak(weakest) >= NAMED else None
-
-
-def _p_weak(weakest: WeakestCell) -> float:
-    return float(expit(weakest.log_factor + np.log(P_FAULT / (1.0 - P_FAULT))))
-
-
-class _Residual(NamedTuple):
-    """Published minus corrected SoC and its σ at the rows of a stretch [%]."""
-
-    soc_pct: FloatArray
-    std_pct: FloatArray
-
-
-def _corrected(
-    chain: Chain, fits: Sequence[Fitted], weakest: WeakestCell | None
-) -> list[_Residual]:
-    """Return the SoC that all sets of faults together imply, at the rows of each stretch.
-
-    A pack is as empty as its weakest cell.
-    """
-    share = np.array([fit.share for fit in fits])
-    found = []
-    for k, part in enumerate(chain.stretches):
-        soc = np.array([fit.soc_pct[k] for fit in fits])
-        mean = share @ soc
-        variance = share @ (np.array([fit.std_pct[k] for fit in fits]) ** 2 + (soc - mean) ** 2)
-        std = np.interp(part.row_hours, part.hours, np.sqrt(variance))
-        counted = np.interp(part.row_hours, part.hours, mean + part.drawn_pct)
-        row = counted - part.row_drawn_pct
-        if weakest is not None:
-            std = np.hypot(std, weakest.std_pct * (100.0 - row) / 100.0)
-            row = row - weakest.behind_pct(row)
-        found.append(_Residual(row, std))
-    return found
+    return weakest if weakest is not None and weakest.probability >= NAMED else None
 
 
 def _judgement(
-    logs: tuple[Log, ...],
-    model: Model,
-    chain: Chain,
-    fits: list[Fitted],
-    weakest: WeakestCell | None,
+    logs: tuple[Log, ...], chain: Chain, fits: list[Fitted], weakest: WeakestCell | None
 ) -> Judgement:
     """Return what all sets of faults say together, each by its probability.
 
     The SoC is that of the sets in which the gauge's present level is free: it does not confirm
-    itself.
+    itself. A pack is as empty as its weakest cell.
     """
-    published = [published_pct(log) for log in logs]
-    corrected = [np.full(len(log), np.nan) for log in logs]
-    std = [np.full(len(log), np.nan) for log in logs]
     free = [fit for fit in fits if fit.is_free] or fits
-    total = sum(fit.share for fit in free)
-    free = [replace(fit, share=fit.share / total) for fit in free]
-    of_stretches = _corrected(chain, free, weakest)
-    for part, found in zip(chain.stretches, of_stretches, strict=True):
-        corrected[part.log][part.rows] = found.soc_pct
-        std[part.log][part.rows] = found.std_pct
-    last = max(
-        k for k, part in enumerate(chain.stretches) if np.isfinite(part.published.shown_pct).any()
-    )
-    shown = chain.stretches[last].published.shown_pct
-    row = int(np.flatnonzero(np.isfinite(shown))[-1])
-    error = float(shown[row] - of_stretches[last].soc_pct[row])
-    error_std = float(of_stretches[last].std_pct[row])
-    within_off, within_agrees = (
-        _within(chain, free, (last, row), error, limit) for limit in (OFF_PCT, AGREES_PCT)
-    )
-    pieces = _pieces(chain, fits, of_stretches)
+    share = np.array([fit.share for fit in free])
+    share /= share.sum()
+    soc, std = np.array([fit.soc_pct for fit in free]), np.array([fit.std_pct for fit in free])
+    mean = share @ soc
+    total = np.sqrt(share @ (std**2 + (soc - mean) ** 2))
+    corrected = chain.at_samples(mean + chain.blocks.drawn_pct) - chain.samples.drawn_pct
+    corrected_std = chain.at_samples(total)
+    if weakest is not None:
+        corrected_std = np.hypot(corrected_std, weakest.std_pct * (100.0 - corrected) / 100.0)
+        corrected = corrected - weakest.behind_pct(corrected)
+    pieces = _pieces(chain, fits[0], corrected, corrected_std)
     faults = _faults(chain, fits, pieces)
     if weakest is not None:
         size, half = weakest.lack_pct, SURE * weakest.std_pct
         interval = (size - half, size + half)
-        faults.append(FoundFault("weak_cell", _p_weak(weakest), size, interval, "%", None))
-    ratio = _contradiction(chain)
+        faults.append(FoundFault("weak_cell", weakest.probability, size, interval, "%", None))
+    row = int(np.flatnonzero(np.isfinite(chain.published.shown_pct))[-1])
+    stretch = chain.stretches[chain.samples.stretch[row]]
+    ends_h = chain.blocks.hours[stretch.blocks] <= chain.samples.hours[row]
+    block = stretch.blocks.start + max(int(np.count_nonzero(ends_h)) - 1, 0)
+    errors = pieces[-1].error_pct - (soc - mean)[:, block]
+
+    def within(limit_pct: float) -> float:
+        ends = ndtr((np.array([[limit_pct], [-limit_pct]]) - errors) / std[:, block])
+        return float((ends[0] - ends[1]) @ share)
+
     verdict: Verdict = "cannot_tell"
-    if ratio is None:
-        if (pieces and pieces[-1].stands_at_pct is not None) or 1.0 - within_off >= OFF_FROM:
-            verdict = "off"
-        elif within_agrees >= AGREES_FROM and not _may_stand(chain.stretches[: last + 1]):
-            verdict = "agrees"
-    else:
-        faults = []
+    if pieces[-1].stands_at_pct is not None or 1.0 - within(OFF_PCT) >= OFF_FROM:
+        verdict = "off"
+    elif within(AGREES_PCT) >= AGREES_FROM and not _may_stand(chain):
+        verdict = "agrees"
     return Judgement(
-        logs,
-        model,
-        chain,
-        fits,
-        published,
-        corrected,
-        std,
-        verdict,
-        error,
-        error_std,
-        pieces,
-        sorted(faults, key=lambda fault: -fault.probability),
-        ratio,
-        weakest,
+        logs=logs,
+        model=chain.model,
+        fits=fits,
+        corrected_pct=_of_logs(chain, logs, corrected),
+        corrected_std_pct=_of_logs(chain, logs, corrected_std),
+        verdict=verdict,
+        error_pct=pieces[-1].error_pct,
+        error_std_pct=pieces[-1].std_pct,
+        pieces=pieces,
+        faults=sorted(faults, key=lambda fault: -fault.probability),
+        was_full=bool(chain.is_full.any()),
+        weakest=weakest,
     )
 
 
-def _may_stand(parts: Sequence[Stretch]) -> bool:
+def _of_logs(chain: Chain, logs: Sequence[Log], values: FloatArray) -> list[FloatArray]:
+    """Return values of the samples at each row of each log; NaN where it has none."""
+    found = [np.full(len(log), np.nan) for log in logs]
+    for stretch in chain.stretches:
+        found[stretch.log][stretch.rows] = values[stretch.samples]
+    return found
+
+
+def _may_stand(chain: Chain) -> bool:
     """Return whether the gauge has not moved at the end where a dashboard would have shown it."""
-    held_pct, end_pct = 0.0, np.nan
-    for part in reversed(parts):
-        shown = part.published.shown_pct[np.isfinite(part.published.shown_pct)]
-        if not shown.size or (held_pct and shown[-1] != end_pct):
-            break
-        held_pct, end_pct = held_pct + part.published.held_pct, shown[-1]
-        if np.ptp(shown) > 0.0:
-            break
-    return held_pct >= JUMP_PCT + 2.0 * parts[-1].published.step_pct
+    known = np.flatnonzero(np.isfinite(chain.published.shown_pct))
+    shown = chain.published.shown_pct[known]
+    same = known[np.max(np.flatnonzero(shown != shown[-1]), initial=-1) + 1 :]
+    _, first = np.unique(chain.samples.stretch[same], return_index=True)
+    held_pct = float(chain.published.held_pct[same[first]].sum())
+    return held_pct >= JUMP_PCT + 2.0 * float(chain.published.step_pct[known[-1]])
 
 
-def _within(
-    chain: Chain, fits: Sequence[Fitted], at: tuple[int, int], error_pct: float, limit_pct: float
-) -> float:
-    """Return the probability that the error at a row of a stretch is within a limit.
-
-    `error_pct` is the mean over all sets of faults.
-    """
-    k, row = at
-    part = chain.stretches[k]
-    hours, share = part.row_hours[row], np.array([fit.share for fit in fits])
-    counted = [np.interp(hours, part.hours, fit.soc_pct[k] + part.drawn_pct) for fit in fits]
-    stds = [np.interp(hours, part.hours, fit.std_pct[k]) for fit in fits]
-    errors = error_pct - (np.array(counted) - share @ counted)
-    ends = np.array([[-limit_pct], [limit_pct]])
-    return float(share @ np.diff(ndtr((ends - errors) / stds), axis=0)[0])
+def _moment(chain: Chain, row: int) -> Moment:
+    log = chain.stretches[chain.samples.stretch[row]].log
+    return Moment(log, float(chain.samples.time_s[row]))
 
 
-def _pieces(chain: Chain, fits: Sequence[Fitted], corrected: Sequence[_Residual]) -> list[Piece]:
-    """Return what the gauge did between its jumps, and where it stood still."""
-    levels = [fault for fault in fits[0].faults if fault.name == "start_or_reset"]
-    resets = {
-        k
-        for fault in levels
-        for k in (fault.since, max(fault.blocks) + 1)
-        if 0 < k < len(chain.stretches)
-        and all(fault.piece in chain.stretches[j].piece for j in (k - 1, k))
-    }  # in a pause
-    runs: list[tuple[object, int, int, int, int, float]] = []
-    for k, part in enumerate(chain.stretches):
-        shown = part.published.shown_pct
-        label = part.published.piece.astype(np.float64)
-        known = np.flatnonzero(label >= 0)
-        held = np.zeros(len(label))
-        if known.size:
-            label = label[
-                known[np.maximum(np.searchsorted(known, np.arange(len(label)), "right") - 1, 0)]
-            ]
-        for number_of, stand in enumerate(part.published.stands):
-            label[stand.first : stand.last + 1] = -2.0 - number_of
-            held[stand.first : stand.last + 1] = stand.moved_pct
-        rows = np.flatnonzero(np.isfinite(shown))
-        if not rows.size:
-            continue
-        edges = np.flatnonzero(np.diff(label[rows], prepend=np.nan) != 0.0)
-        for first, last in zip(edges, [*edges[1:], rows.size], strict=True):
-            low, high = int(rows[first]), int(rows[last - 1])
-            moved = float(held[low])
-            key: object = ("stands", float(shown[low])) if moved else float(label[low])
-            is_new = k in resets and first == 0 and not moved
-            if runs and runs[-1][0] == key and not is_new:
-                of, k0, low0, _, _, before = runs[-1]
-                runs[-1] = (of, k0, low0, k, high, max(before, moved))
-            else:
-                runs.append((key, k, low, k, high, moved))
+def _pieces(
+    chain: Chain, best: Fitted, corrected_pct: FloatArray, std_pct: FloatArray
+) -> list[Piece]:
+    """Return what the gauge did between its jumps and resets, and where it stood still."""
+    resets = np.zeros(len(chain.stretches), dtype=np.intp)  # in the pause before a stretch
+    for fault in best.faults:
+        if fault.place[0] == "level":
+            changed = np.unique(chain.blocks.stretch[np.asarray(fault.shown) != 0.0])
+            goes_on = np.unique(chain.blocks.stretch[chain.piece == fault.piece])
+            resets[np.intersect1d([changed[0], changed[-1] + 1], goes_on[1:])] = 1
+    published = chain.published
+    latest = np.maximum.accumulate(np.maximum(chain.row_piece, 0))
+    numbers = latest * resets.size + np.cumsum(resets)[chain.samples.stretch]
+    rows = np.flatnonzero(np.isfinite(published.shown_pct))
+    label = np.where(published.stands, -1.0 - published.shown_pct, numbers)[rows]
+    edges = np.flatnonzero(np.diff(label, prepend=np.nan, append=np.nan) != 0.0)
     found = []
-    for key, k0, low, k1, high, moved in runs:
-        part0, part1 = chain.stretches[k0], chain.stretches[k1]
-        error = float(part1.published.shown_pct[high] - corrected[k1].soc_pct[high])
+    for low, high in pairwise(edges):
+        last, stands = rows[high - 1], bool(published.stands[rows[low]])
         found.append(
             Piece(
-                Moment(part0.log, float(part0.row_time_s[low])),
-                Moment(part1.log, float(part1.row_time_s[high])),
-                error,
-                float(corrected[k1].std_pct[high]),
-                key[1] if isinstance(key, tuple) else None,
-                moved,
+                begin=_moment(chain, rows[low]),
+                end=_moment(chain, last),
+                error_pct=float(published.shown_pct[last] - corrected_pct[last]),
+                std_pct=float(std_pct[last]),
+                stands_at_pct=float(published.shown_pct[last]) if stands else None,
+                moved_pct=stands * float(published.held_pct[rows[low:high]].max()),
             )
         )
     return found
@@ -380,37 +305,36 @@ def _pieces(chain: Chain, fits: Sequence[Fitted], corrected: Sequence[_Residual]
 
 def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> list[FoundFault]:
     """Return the faults that are probable, of a possible size, and matter."""
-    by_place = dict[tuple[str, int, int], list[tuple[float, Term, float, float]]]()
+    shapes = dict[tuple[str | int, ...], list[tuple[Column, float, float, float]]]()
     for fit in fits:
-        for term, size, std in zip(fit.faults, fit.size, fit.std, strict=True):
-            place = (term.name, *term.place[1:])
-            by_place.setdefault(place, []).append((fit.share, term, float(size), float(std)))
+        for column, size, std in zip(fit.faults, fit.size, fit.std, strict=True):
+            place = (column.name, *column.place[1:])
+            shapes.setdefault(place, []).append((column, fit.share, float(size), float(std)))
     found = []
-    for (name, *_), shapes in by_place.items():
-        share = np.array([shape[0] for shape in shapes])
-        sizes, stds = (np.array([shape[j] for shape in shapes]) for j in (2, 3))
-        probability = float(share.sum())
+    for of_place in shapes.values():
+        share, sizes, stds = np.array([numbers for _, *numbers in of_place]).T
+        column, probability = of_place[int(np.argmax(share))][0], float(share.sum())
         within = share / probability
         size = float(within @ sizes)
         std = float(np.sqrt(within @ (stds**2 + (sizes - size) ** 2)))
-        term = shapes[int(np.argmax(share))][1]
-        is_possible = abs(size) <= BEYOND * term.std * term.per_unit
-        if probability < NAMED or not is_possible or _moves_pct(term, size) < MATERIAL_PCT:
+        is_possible = abs(size) <= BEYOND * column.std * column.per_unit
+        if probability < NAMED or not is_possible or _moves_pct(chain, column, size) < MATERIAL_PCT:
             continue
         since = None
-        if term.piece > 0 or term.since > 0:
-            part = chain.stretches[term.since]
-            at = np.flatnonzero(part.published.piece == term.piece)
-            since = Moment(part.log, float(part.row_time_s[int(at[0]) if at.size else 0]))
+        if column.piece > 0 or column.since:
+            is_after = chain.samples.stretch >= column.since
+            is_inside = is_after & ((column.piece < 0) | (chain.row_piece == column.piece))
+            since = _moment(chain, int(np.argmax(is_inside)))
         interval = (size - SURE * std, size + SURE * std)
-        found.append(FoundFault(name, min(probability, 1.0), size, interval, term.unit, since))
+        kind = FAULTS[column.name]
+        found.append(
+            FoundFault(column.name, min(probability, 1.0), size, interval, kind.unit, since)
+        )
     # At a limit a gauge may count on unseen, unless it never leaves it.
     stands = [
-        piece
-        for piece in pieces
-        if piece.stands_at_pct is not None
-        and (piece is pieces[-1] or not is_limit(np.array(piece.stands_at_pct)))
+        piece for piece in pieces[:-1] if piece.stands_at_pct and not is_limit(piece.stands_at_pct)
     ]
+    stands += [piece for piece in pieces[-1:] if piece.stands_at_pct is not None]
     if stands:
         longest = max(stands, key=lambda piece: piece.moved_pct)
         moved = longest.moved_pct
@@ -418,42 +342,13 @@ def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> li
     return found
 
 
-def _moves_pct(term: Term, size: float) -> float:
+def _moves_pct(chain: Chain, column: Column, size: float) -> float:
     """Return the most by which a fault moves published against true SoC [%]."""
-    if term.name in {"voltage_sensor", "model_capacity"}:  # of the log and of the model
+    if column.name in {"voltage_sensor", "model_capacity"}:  # of the log and of the model
         return np.inf
-    most = max(
-        float(np.max(np.abs(np.asarray(block.shown) - np.asarray(block.soc))))
-        for block in term.blocks.values()
-    )
-    return abs(size) / term.per_unit * most
-
-
-def _contradiction(chain: Chain) -> float | None:
-    """Return charge over what the published SoC moves by, where no gauge is so wrong; else None.
-
-    The charge is too large for the SoC by the median over all movements of it, so that a gauge that
-    stands still is none, and too small by the regression, so that one that jumps is none.
-    """
-    ratios, products, squares, moved = list[float](), 0.0, 0.0, 0.0
-    for part in chain.stretches:
-        known = np.isfinite(part.published.shown_pct)
-        shown, charge = part.published.shown_pct[known], -part.row_drawn_pct[known]
-        if not known.any():
-            continue
-        step = np.floor((shown - shown[0]) / LEAST_MOVED_PCT)
-        ends = np.flatnonzero(np.diff(step, append=np.nan) != 0.0)
-        moves = np.diff(shown[ends])
-        is_far = np.abs(moves) >= 0.5 * LEAST_MOVED_PCT
-        ratios += (np.diff(charge[ends])[is_far] / moves[is_far]).tolist()
-        products += float(np.sum((shown - shown.mean()) * (charge - charge.mean())))
-        squares += float(np.sum((charge - charge.mean()) ** 2))
-        moved = max(moved, float(np.ptp(charge)))
-    if len(ratios) >= 3 and abs(np.median(ratios)) > CONTRADICTION:
-        return float(np.median(ratios))
-    if moved >= LEAST_MOVED_PCT and products > CONTRADICTION * squares:
-        return squares / products
-    return None
+    counted = chain.piece >= 0
+    moves = np.broadcast_to(np.abs(np.asarray(column.shown) - column.soc), counted.size)
+    return abs(size) / column.per_unit * float(moves[counted].max())
 
 
 def narrowed(judgement: Judgement) -> Model:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cangauge._text import counted, number
-from cangauge.extras.judge.result import Judgement
+from cangauge.extras.judge.result import DAY_S, Judgement, is_dated
+from cangauge.extras.judge.text import moment, signed
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
 from cangauge.extras.report.page import Page, Table, Tile, joined
+from cangauge.logs.log import Log
 
 
 def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
@@ -24,12 +27,11 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
     logs = judgement.logs
     first, *rest = judgement.text.split("\n")
     std = number(judgement.error_std_pct, 1, "%")
-    days = counted(judgement.days, "day")
-    faults = [Table(*judgement.fault_rows())] if judgement.faults else []
+    faults = [_fault_table(judgement)] if judgement.faults else []
     return Page(
         title=f"Second opinion on the gauge of {joined([log.name for log in logs])}",
         lead=first,
-        subtitle=f"{counted(len(logs), 'log')}, {days}, judged by {judgement.model.name}.",
+        subtitle=f"{counted(len(logs), 'log')}, {_days(logs)}, judged by {judgement.model.name}.",
         tiles=[
             Tile("Verdict now", judgement.verdict.replace("_", " ")),
             Tile("Error now", number(judgement.error_pct, 1, "% SoC"), f"σ {std}"),
@@ -38,11 +40,47 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
             "Why, and what next": [[text] for text in rest],
             "Both states of charge": [_figure(judgement)],
         },
-        folded={"Faults": faults, "Pieces": [Table(*judgement.piece_rows())]},
+        folded={"Faults": faults, "Pieces": [_piece_table(judgement)]},
         model=judgement.model,
         model_path=model_path,
         logs=logs,
     )
+
+
+def _days(logs: Sequence[Log]) -> str:
+    """Return the number of days with logs: by their stamps, or one for each log."""
+    if not is_dated(logs):
+        return counted(len(logs), "day")
+    stamps = np.concatenate([log.time_s for log in logs])
+    return counted(int(np.unique(np.floor(stamps / DAY_S)).size), "day")
+
+
+def _piece_table(judgement: Judgement) -> Table:
+    rows = [
+        [
+            moment(judgement, piece.begin),
+            moment(judgement, piece.end),
+            signed(piece.error_pct),
+            number(piece.std_pct, 1),
+            "" if piece.stands_at_pct is None else f"at {number(piece.stands_at_pct, 1)} %",
+        ]
+        for piece in judgement.pieces
+    ]
+    return Table(["from", "until", "error at its end [% SoC]", "σ", "stands still"], rows)
+
+
+def _fault_table(judgement: Judgement) -> Table:
+    rows = [
+        [
+            fault.name.replace("_", " "),
+            number(100.0 * fault.probability, 0),
+            f"{signed(fault.size, 2)} {fault.unit}",
+            f"{signed(fault.interval[0], 2)} … {signed(fault.interval[1], 2)}",
+            "before the first log" if fault.since is None else moment(judgement, fault.since),
+        ]
+        for fault in judgement.faults
+    ]
+    return Table(["fault", "probability [%]", "size", "95 %", "since"], rows)
 
 
 def _figure(judgement: Judgement) -> Figure:

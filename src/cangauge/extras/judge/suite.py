@@ -8,28 +8,28 @@ before the first frame, to say that it is ready. Each run is a process of its ow
 
 from __future__ import annotations
 
+import logging
 import math
 import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from cangauge._resources import shared_file
-from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.database import SignalCodec, find_message, load_dbc, signal_codec
+from cangauge.bus.database import find_message, load_dbc, signal_codec
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.time_source import MICROSECONDS, ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
-from cangauge.extras.validation.cases import draw_scenario
-from cangauge.extras.validation.twin.recording import record_drive
+from cangauge.extras.validation.twin.simulation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
@@ -58,59 +58,46 @@ TYPICAL_AH: Final = 60.0
 """Capacity for which currents of the faults are stated [Ah]; other packs: in proportion."""
 
 
-@dataclass(frozen=True)
-class PlayedDrive:
-    """A drive with the true SoC [%] of its rows, and the model of its pack."""
+_LOG: Final = logging.getLogger(__name__)
 
-    name: str
+
+class PlayedDrive(NamedTuple):
+    """A drive with the true SoC of its rows [%], and the model of its pack."""
+
     log: Log
     true_pct: FloatArray
     model: Model
 
 
-@dataclass(frozen=True)
-class CountFault:
-    """What is wrong with the count that a gauge can make.
-
-    Parameters
-    ----------
-    name : str
-    offset_a, step_a, dead_a : float
-        Added to the current, its resolution, and below which it reads zero, at 60 Ah [A].
-    gain : float
-    start_pct : float
-        Error of the stated start [% SoC].
-    lost : float
-        Share of the samples whose frames are lost.
-    gap_s : float
-        Without frames, from a quarter of the drive on [s].
-    late_rows : int
-        Rows by which the current is late.
-    limit_c : float
-        Largest current that is read, over the capacity [1/h].
-    """
+class CountFault(NamedTuple):
+    """What is wrong with the count that a gauge can make."""
 
     name: str
     offset_a: float = 0.0
+    """Added to the current, at 60 Ah [A]."""
     step_a: float = 0.0
+    """Resolution of the current, and below which it reads zero, at 60 Ah [A]."""
     dead_a: float = 0.0
     gain: float = 1.0
     start_pct: float = 0.0
+    """Error of the stated start [% SoC]."""
     lost: float = 0.0
+    """Share of the samples whose frames are lost."""
     gap_s: float = 0.0
+    """Without frames, from a quarter of the drive on [s]."""
     late_rows: int = 0
+    """Rows by which the current is late."""
     limit_c: float = math.inf
+    """Largest current that is read, over the capacity [1/h]."""
 
     def current_a(self, log: Log, capacity_ah: float) -> FloatArray:
         """Return the current that the gauge reads [A]."""
-        size = capacity_ah / TYPICAL_AH
-        current = self.gain * log.current_a + size * self.offset_a
-        if self.late_rows:
-            current = np.concatenate([np.full(self.late_rows, current[0]), current])[: len(log)]
+        size, limit_a = capacity_ah / TYPICAL_AH, self.limit_c * capacity_ah
+        late = np.maximum(np.arange(len(log)) - self.late_rows, 0)
+        current = self.gain * log.current_a[late] + size * self.offset_a
         if self.step_a:
             current = size * self.step_a * np.round(current / (size * self.step_a))
         current = np.where(np.abs(current) < size * self.dead_a, 0.0, current)
-        limit_a = self.limit_c * capacity_ah
         return np.asarray(np.clip(current, -limit_a, limit_a))
 
     def sent(self, log: Log) -> BoolArray:
@@ -137,8 +124,7 @@ FAULTS: Final = (
 """No fault, and twenty."""
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """What a gauge made of a fault, over all drives.
 
     Errors in % SoC; shares of the readings. `recovery_s` is the time after which the error stays
@@ -159,42 +145,37 @@ def simulated_drives() -> list[PlayedDrive]:
     """Return twelve drives of four simulated packs, with models of other drives of theirs."""
     found = []
     for seed in PACKS:
-        scenario = draw_scenario(seed, n_training=3, n_temperatures=2)
-        training = [replace(each.log, soc_pct=each.true_soc_pct) for each in scenario.training]
-        model = fit(training, capacity_ah=scenario.pack.capacity_ah).model
-        drives = scenario.draw_drives(np.random.default_rng(seed), DRIVES_A_PACK, HOURS)
-        for number, drive in enumerate(drives, start=1):
-            made = record_drive(scenario.plant, drive, ())
-            rows = _every_second(made.log)
-            found.append(
-                PlayedDrive(f"{seed}/{number}", made.log.rows(rows), made.true_soc_pct[rows], model)
-            )
+        runs = [simulate(seed=seed, discharge=True)]
+        runs += [simulate(seed=seed, drive=2 + k, hours=HOURS) for k in range(2 * DRIVES_A_PACK)]
+        logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
+        model = fit(logs[:-DRIVES_A_PACK], capacity_ah=runs[0].plant.pack.capacity_ah).model
+        found += _played(logs[-DRIVES_A_PACK:], model)
     return found
 
 
 def recorded_drives(paths: Sequence[Path], model: Model) -> list[PlayedDrive]:
     """Return drives of recorded logs of a model's pack; may raise InputError."""
+    return _played([open_log(path).read() for path in paths], model)
+
+
+def _played(logs: Sequence[Log], model: Model) -> list[PlayedDrive]:
+    """Return logs with their true SoC as drives of a row a second."""
     found = []
-    for path in paths:
-        log = open_log(path).read()
+    for log in logs:
         if log.soc_pct is None or not np.isfinite(log.soc_pct).all():
-            cure = "give logs with the true SoC in each row"
-            raise InputError("the true SoC is missing", source=path, field="soc_pct", cure=cure)
-        rows = _every_second(log)
-        found.append(PlayedDrive(path.stem, log.rows(rows), log.soc_pct[rows], model))
+            problem, cure = "the true SoC is missing", "give logs with the true SoC in each row"
+            raise InputError(problem, source=log.source, field="soc_pct", cure=cure)
+        step_s = float(np.median(np.diff(log.time_s)))
+        every = slice(None, None, max(1, round(1.0 / step_s)))
+        found.append(PlayedDrive(log.rows(every), log.soc_pct[every], model))
     return found
-
-
-def _every_second(log: Log) -> slice:
-    step_s = float(np.median(np.diff(log.time_s)))
-    return slice(None, None, max(1, round(1.0 / step_s)))
 
 
 def run_suite(
     command: Sequence[str],
     drives: Sequence[PlayedDrive],
     faults: Sequence[CountFault] = FAULTS,
-    show: Callable[[str], None] = lambda _: None,
+    show: Callable[[str], None] = _LOG.debug,
 ) -> list[Score]:
     """Play all drives with all faults to a gauge; return a score for each fault.
 
@@ -222,28 +203,25 @@ def run_suite(
         tempfile.TemporaryDirectory(prefix="cangauge-suite-") as folder,
         BusConnection(open_bus(address), str(address)) as bus,
     ):
-        gauge = _Gauge(bus, address, Path(folder), [*command])
+        gauge = _Gauge(bus, address, Path(folder), command)
         for number, fault in enumerate(faults, start=1):
             show(f"fault {number} of {len(faults)}: {fault.name}")
-            runs = [gauge.play(drive, fault) for drive in drives]
-            scores.append(_score(fault, drives, runs))
+            scores.append(_score(fault, drives, [gauge.play(drive, fault) for drive in drives]))
     return scores
 
 
-Reading = tuple[IntArray, FloatArray, FloatArray]
-"""Row of the drive, SoC and σ [%] of each reading; NaN where the gauge said nothing."""
-
-
 class _Gauge:
+    """A gauge under test on a bus."""
+
     def __init__(
-        self, bus: BusConnection, address: BusAddress, folder: Path, command: list[str]
+        self, bus: BusConnection, address: BusAddress, folder: Path, command: Sequence[str]
     ) -> None:
         self._bus, self._address, self._folder, self._command = bus, address, folder, command
         path = shared_file("dbc", "soc_estimate.dbc")
         message = find_message(load_dbc(path), "SOC_ESTIMATE", source=path, field="SOC_ESTIMATE")
         signals = {signal.name: signal for signal in message.signals}
         self._id = message.frame_id
-        self._codecs: list[SignalCodec] = [
+        self._codecs = [
             signal_codec(message, signals[name], source=path, field=name)
             for name in ("soc_pct", "soc_std_pct")
         ]
@@ -251,9 +229,11 @@ class _Gauge:
         self._was_ready = False
         self._answers_a_sample = 1.0
 
-    def play(self, drive: PlayedDrive, fault: CountFault) -> Reading:
-        """Play a drive to a new gauge."""
-        capacity_ah = drive.model.capacity_ah
+    def play(self, drive: PlayedDrive, fault: CountFault) -> FloatArray:
+        """Play a drive to a new gauge; return row, SoC and σ [%] of each reading, shape (3, n).
+
+        SoC and σ are NaN where the gauge said nothing.
+        """
         model = self._folder / f"{drive.model.made.fingerprint[:16]}.json"
         drive.model.save(model)
         start_pct = min(max(float(drive.true_pct[0]) + fault.start_pct, 0.0), 100.0)
@@ -262,7 +242,7 @@ class _Gauge:
             "channel": self._address.channel,
             "port": self._address.options["port"],
             "model": model,
-            "capacity_ah": f"{capacity_ah:g}",
+            "capacity_ah": f"{drive.model.capacity_ah:g}",
             "soc": f"{start_pct:.2f}",
         }
         command = [_filled(word, places) for word in self._command]
@@ -273,7 +253,6 @@ class _Gauge:
                 raise InputError(f"cannot be started: {error}", field="COMMAND") from error
             try:
                 is_ready = self._becomes_ready(process)
-                self._was_ready = True
                 return self._readings(drive, fault, is_ready=is_ready)
             finally:
                 process.terminate()
@@ -291,6 +270,7 @@ class _Gauge:
         while time.monotonic() < until_s and process.poll() is None:
             message = self._bus.receive(0.1)
             if message is not None and message.arbitration_id == self._id:
+                self._was_ready = True
                 return True
         if self._was_ready:
             return False
@@ -300,28 +280,26 @@ class _Gauge:
         text = f"{' '.join(self._command)}: {problem} publishing SOC_ESTIMATE"
         raise CangaugeError(f"{text}; it said: {said}" if said else text)
 
-    def _readings(self, drive: PlayedDrive, fault: CountFault, *, is_ready: bool) -> Reading:
+    def _readings(self, drive: PlayedDrive, fault: CountFault, *, is_ready: bool) -> FloatArray:
         """Send a drive to a gauge that is ready, and read it every `ANSWER_EVERY_S`."""
         log, encoder = drive.log, FrameEncoder(self._vehicle)
-        current_a = fault.current_a(log, drive.model.capacity_ah)
-        sent = fault.sent(log)
+        current_a, sent = fault.current_a(log, drive.model.capacity_ah), fault.sent(log)
         since_s = log.time_s - log.time_s[0]
         parted = np.flatnonzero(np.diff((since_s / ANSWER_EVERY_S).astype(int))) + 1
         batches = np.split(np.arange(len(log)), parted)
-        readings, silent = np.full((len(batches), 2), np.nan), 0
+        readings = np.full((3, len(batches)), np.nan)
+        readings[0] = [rows[-1] for rows in batches]
+        columns = np.array([log.time_s, current_a, log.voltage_v, log.temperature_c])
         for number, rows in enumerate(batches if is_ready else ()):
             for row in rows[sent[rows]]:
-                values = (log.time_s, current_a, log.voltage_v, log.temperature_c)
-                sample = Sample(*(float(column[row]) for column in values))
                 self._bus.send(self._clock.at(round(since_s[row] * MICROSECONDS)))
-                for frame in encoder.encode(sample):
+                for frame in encoder.encode(Sample(*columns[:, row].tolist())):
                     self._bus.send(frame)
-            readings[number] = self._answer(int(sent[rows].sum()))
-            silent = 0 if math.isfinite(readings[number, 0]) else silent + 1
-            if silent >= SILENT_AT_MOST:
+            readings[1:, number] = self._answer(int(sent[rows].sum()))
+            last = readings[1, max(0, number + 1 - SILENT_AT_MOST) : number + 1]
+            if last.size == SILENT_AT_MOST and np.isnan(last).all():
                 break
-        ends = np.array([rows[-1] for rows in batches])
-        return ends, readings[:, 0], readings[:, 1]
+        return readings
 
     def _answer(self, samples: int) -> tuple[float, float]:
         """Return SoC and σ after so many samples; NaN if the gauge said nothing.
@@ -355,31 +333,30 @@ def _filled(word: str, places: Mapping[str, object]) -> str:
     return word
 
 
-def _score(fault: CountFault, drives: Sequence[PlayedDrive], runs: Sequence[Reading]) -> Score:
-    errors, recoveries, jumps, hours, covered = [], [], 0, 0.0, []
-    silent = np.concatenate([np.isnan(soc) for _, soc, _ in runs])
-    for drive, (at, soc_pct, std_pct) in zip(drives, runs, strict=True):
-        error = soc_pct - drive.true_pct[at]
+def _score(
+    fault: CountFault, drives: Sequence[PlayedDrive], readings: Sequence[FloatArray]
+) -> Score:
+    errors, sigmas, recoveries, jumps, hours = [], [], [], 0, 0.0
+    for (log, true_pct, model), (rows, soc_pct, std_pct) in zip(drives, readings, strict=True):
+        at = rows.astype(np.intp)
+        error, since_s = soc_pct - true_pct[at], log.time_s[at] - log.time_s[0]
+        bad = ~(np.abs(error) < RECOVERED_PCT)  # silence is no recovery
+        recoveries.append(math.inf if bad[-1] else float(np.max(since_s[bad], initial=0.0)))
         known = np.isfinite(error)
-        errors.append(error[known])
-        since_s = drive.log.time_s[at] - drive.log.time_s[0]
-        bad = np.flatnonzero(~(np.abs(error) < RECOVERED_PCT))  # silence is no recovery
-        recoveries.append(
-            0.0 if not bad.size else math.inf if bad[-1] == at.size - 1 else since_s[bad[-1]]
-        )
-        drawn_ah = discharged_ah(drive.log.time_s, drive.log.current_a)[at]
-        moved = np.diff(soc_pct[known]) + 100.0 * np.diff(drawn_ah[known]) / drive.model.capacity_ah
-        jumps += int((np.abs(moved) > JUMP_PCT).sum())
-        hours += float(since_s[-1]) / 3600.0
-        with_std = known & np.isfinite(std_pct)
-        covered.append(np.abs(error[with_std]) <= 2.0 * std_pct[with_std])
-    every, within = np.abs(np.concatenate(errors)), np.concatenate(covered)
+        drawn_pct = 100.0 * discharged_ah(log.time_s, log.current_a)[at] / model.capacity_ah
+        jumps += int((np.abs(np.diff((soc_pct + drawn_pct)[known])) > JUMP_PCT).sum())
+        hours += since_s[-1] / 3600.0
+        errors.append(error)
+        sigmas.append(std_pct)
+    error, std = np.concatenate(errors), np.concatenate(sigmas)
+    known = np.abs(error[np.isfinite(error)])
+    covered = (np.abs(error) <= 2.0 * std)[np.isfinite(error) & np.isfinite(std)]
     return Score(
         fault=fault.name,
-        mae_pct=float(every.mean()) if every.size else math.nan,
-        worst_pct=float(every.max()) if every.size else math.nan,
-        jumps_per_h=jumps / hours if every.size else math.nan,
+        mae_pct=float(known.mean()) if known.size else math.nan,
+        worst_pct=float(known.max()) if known.size else math.nan,
+        jumps_per_h=jumps / hours if known.size else math.nan,
         recovery_s=float(np.median(recoveries)),
-        cover_2sigma=float(within.mean()) if within.size else None,
-        silent=float(silent.mean()),
+        cover_2sigma=float(covered.mean()) if covered.size else None,
+        silent=float(np.isnan(error).mean()),
     )

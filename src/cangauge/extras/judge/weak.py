@@ -15,8 +15,10 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
 from cangauge._typing import FloatArray
+from cangauge.extras.judge.faults import P_FAULT
 
 WEAK_STD_PCT: Final = 15.0
 """Standard deviation of a weak cell's lack of capacity [%]."""
@@ -40,6 +42,11 @@ class WeakestCell(NamedTuple):
     lack_pct: float
     """Capacity that it lacks [%], and its σ."""
     std_pct: float
+
+    @property
+    def probability(self) -> float:
+        """Of a weak cell."""
+        return float(expit(self.log_factor + np.log(P_FAULT / (1.0 - P_FAULT))))
 
     def behind_pct(self, soc_pct: FloatArray) -> FloatArray:
         """Return by how much the cell is behind a pack that was full [% SoC]."""

@@ -1,0 +1,359 @@
+"""Which faults explain the logs, each set of them with its probability.
+
+All quantities of the chain are one linear Gaussian model (`model.gaussian`). Faults are added,
+exchanged and dropped one at a time while that raises the evidence, and at the end every set of
+faults that differs by one counts with its probability: nothing is certain because it was chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from cangauge._typing import FloatArray, IntArray
+from cangauge.extras.judge.chain import Chain
+from cangauge.extras.judge.faults import Column, Priors, faults, healthy
+from cangauge.model.gaussian import GaussianPosterior, Rows
+
+JOINT_PCT: Final = 0.1
+"""NoiseSize of the SoC where one stretch continues another [%]."""
+FULL_STD_PCT: Final = 1.5
+"""Standard deviation of the SoC at the end of a full charge [%]: cut-off current and balancing."""
+MOST_MOVES: Final = 10
+"""Sets of faults that are tried one after the other."""
+BEYOND: Final = 3.0
+"""A fault whose size is beyond so many of its prior standard deviations is no explanation."""
+VOLTAGE_SCALES: Final = (0.5, 1.0, 2.0, 4.0)
+"""Factors on the model's errors of the voltage: a pack on other days may follow its model worse
+than left-out logs did."""
+ITERATIONS: Final = 8
+"""Linearisations at most, …"""
+DAMPING: Final = 0.6
+"""… each this part of the way, since the slope of a curve jumps between its features, …"""
+SETTLED_PCT: Final = 0.1
+"""… until no SoC moves by more [%]."""
+LEAST_SHARE: Final = 0.003
+"""Least probability of a set of faults that counts."""
+
+
+class GaugeNoise(NamedTuple):
+    """Errors of a healthy gauge relative to counted charge, as standard deviations."""
+
+    white_pct: float
+    """Of each block alone [%]."""
+    walk_pct: float
+    """Random walk in an hour [%]."""
+    drift_pct: float
+    """Steady drift over an hour [%]."""
+    scale_pct: float
+    """Error of the charge that a stretch counts [%]."""
+    error_pct: float
+    """Difference of its error between stretches [% SoC]."""
+
+
+GAUGES: Final = (
+    GaugeNoise(0.05, 0.05, 0.1, 0.5, 0.3),
+    GaugeNoise(0.1, 0.15, 0.3, 2.0, 0.6),
+    GaugeNoise(0.5, 0.5, 1.0, 10.0, 1.5),
+    GaugeNoise(3.0, 1.5, 3.0, 30.0, 3.0),
+)
+"""From a pure counter (a BMW i3's) to a gauge that follows the voltage (`batic_car1`'s)."""
+
+
+class NoiseSize(NamedTuple):
+    """Size of the noise."""
+
+    voltage: float
+    """One of `VOLTAGE_SCALES`."""
+    gauge: GaugeNoise | None
+    """None: what the gauge published is withheld."""
+
+
+class Fitted(NamedTuple):
+    """Posterior of a set of faults."""
+
+    share: float
+    """Probability among all sets and sizes of the noise."""
+    faults: tuple[Column, ...]
+    size: FloatArray
+    """Of each fault, and its σ."""
+    std: FloatArray
+    pack_pct: FloatArray
+    """SoC of each block beside the model, …"""
+    soc_pct: FloatArray
+    """… and on the gauge's scale, with its σ [%]."""
+    std_pct: FloatArray
+    functions: FloatArray
+    """Principal functions of the curve after the logs, and their covariance."""
+    covariance: FloatArray
+    is_free: bool
+    """Whether the level of the last piece is free: then the gauge does not confirm itself."""
+
+
+class Linearised:
+    """The model of a chain whose voltage is linearised at a SoC.
+
+    Parameters
+    ----------
+    chain : Chain
+    priors : Priors
+    soc_pct : array of shape (blocks,)
+    only : sequence of int, optional
+        Numbers of the faults that it has; by default all.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        priors: Priors,
+        soc_pct: FloatArray,
+        only: Sequence[int] | None = None,
+    ) -> None:
+        self.chain, self.soc_pct = chain, soc_pct
+        self.healthy, every = healthy(chain, priors, soc_pct), faults(chain, soc_pct)
+        self.faults = every if only is None else [every[k] for k in only]
+        columns = [*self.healthy, *self.faults]
+        self._S, self._Y, self._V = (
+            np.array([np.broadcast_to(getattr(each, of), soc_pct.size) for each in columns]).T
+            for of in ("soc", "shown", "volts")
+        )
+        self._std = np.array([each.std for each in columns])
+        self._log_prior = np.array([fault.log_prior for fault in self.faults])
+        starts = [each.blocks.start for each in chain.stretches]
+        self._start_pct = (soc_pct + chain.blocks.drawn_pct)[starts][chain.blocks.stretch]
+        self._counted_pct = self._start_pct - chain.blocks.drawn_pct
+
+    @cached_property
+    def all_rows(self) -> dict[NoiseSize, Rows]:
+        """Rows at each size of the noise."""
+        of_gauge = [(gauge, self._gauge_rows(gauge)) for gauge in GAUGES]
+        found = dict[NoiseSize, Rows]()
+        for scale in VOLTAGE_SCALES:
+            others = self._voltage_rows(scale) + self._other_rows
+            found |= {NoiseSize(scale, gauge): others + rows for gauge, rows in of_gauge}
+        return found
+
+    def rows(self, noise: NoiseSize) -> Rows:
+        """Return the rows at one size of the noise."""
+        rows = self._voltage_rows(noise.voltage) + self._other_rows
+        return rows if noise.gauge is None else rows + self._gauge_rows(noise.gauge)
+
+    @cached_property
+    def _voltage(self) -> tuple[FloatArray, FloatArray]:
+        """Columns of the voltage of all blocks, and what it leaves beside the counted SoC [V]."""
+        slope = self.chain.slope(self.soc_pct)
+        error_v = self.chain.blocks.voltage_v - self.chain.voltage_v(self.soc_pct)
+        error_v += slope * (self.soc_pct - self._counted_pct)
+        return slope[:, None] * self._S + self._V, error_v
+
+    def _voltage_rows(self, scale: float) -> Rows:
+        """Return the rows of all voltages, the level of each stretch integrated out."""
+        found, (X, error_v) = [], self._voltage
+        for stretch in self.chain.stretches:
+            at, covariance = self.chain.voltage_noise(stretch, scale)
+            with_level = np.column_stack([self.chain.level_v[at], X[at]])
+            rows = Rows.correlated(with_level, error_v[at], _root(covariance))
+            # The level is one number of a stretch: quiet voltages do not prove it small.
+            level = np.array([max(scale, 1.0)])
+            found.append((rows + Rows.prior(level, others=self._std.size)).eliminated(1))
+        return _sum(found)
+
+    def _gauge_rows(self, noise: GaugeNoise) -> Rows:
+        """Return the rows of all counts, what is of each stretch alone integrated out."""
+        found, chain = [], self.chain
+        for stretch in chain.stretches:
+            at = np.flatnonzero(np.isfinite(chain.count_pct[stretch.blocks]))
+            at += stretch.blocks.start
+            hours, drawn = chain.blocks.hours[at], chain.blocks.drawn_pct[at] / 100.0
+            last = stretch.samples.stop - 1
+            step_pct = float(chain.published.step_pct[last])
+            white = noise.white_pct**2 + step_pct**2 / 12.0
+            walk = noise.walk_pct**2 * np.minimum(hours[:, None], hours) + np.eye(at.size) * white
+            X = np.column_stack([np.ones(at.size), hours, drawn, self._Y[at]])
+            y = chain.count_pct[at] - self._start_pct[at]
+            rows = Rows.correlated(X, y, _root(walk))
+            drift = noise.drift_pct / np.sqrt(max(float(chain.samples.hours[last]), 1.0))
+            own = np.array([noise.error_pct, drift, noise.scale_pct])
+            found.append((rows + Rows.prior(own, others=self._std.size)).eliminated(own.size))
+        return _sum(found)
+
+    @cached_property
+    def _other_rows(self) -> Rows:
+        """Rows of full charges, of stretches that continue others, and of the prior."""
+        chain, counted_pct = self.chain, self._counted_pct
+        full = np.flatnonzero(chain.is_full)
+        charged = Rows.of(self._S[full], 100.0 - counted_pct[full], FULL_STD_PCT)
+        later = [k for k, each in enumerate(chain.stretches) if each.continues]
+        first = np.array([chain.stretches[k].blocks.start for k in later], dtype=np.intp)
+        ends = np.array([chain.stretches[k].samples.start - 1 for k in later], dtype=np.intp)
+        drawn_pct = chain.blocks.drawn_pct
+        between_pct = drawn_pct[first] + chain.samples.drawn_pct[ends] - drawn_pct[first - 1]
+        apart_pct = counted_pct[first - 1] - counted_pct[first] - between_pct
+        joined = Rows.of(self._S[first] - self._S[first - 1], apart_pct, JOINT_PCT)
+        prior = Rows.prior(self._std[: len(self.healthy)], others=len(self.faults))
+        return charged + joined + prior
+
+    def log_weights(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return ln of the weight of a set of faults, and with each other fault added to it.
+
+        Returns
+        -------
+        base : array of shape (noises,)
+        more : array of shape (noises, faults)
+            −∞ for other shapes of those in the set.
+        """
+        taken = {self.faults[k].place for k in chosen}
+        others = np.array(
+            [k for k, fault in enumerate(self.faults) if fault.place not in taken], dtype=np.intp
+        )
+        std = self._fault_std(others)
+        base, more = [], np.full((len(self.all_rows), len(self.faults)), -np.inf)
+        for k, rows in enumerate(self.all_rows.values()):
+            of_set = self._chosen(rows, chosen, others)
+            added = of_set.added(len(self.healthy) + len(chosen), std)
+            base.append(added.log_evidence + float(self._log_prior[list(chosen)].sum()))
+            size = added.mean / std
+            is_positive = np.array([self.faults[k].is_positive for k in others], dtype=bool)
+            is_sound = (np.abs(size) <= BEYOND) & ((size > 0.0) | ~is_positive)
+            gain = np.where(is_sound, added.log_factor, -np.inf)
+            more[k, others] = base[k] + gain + self._log_prior[others]
+        return np.array(base), more
+
+    def _fault_std(self, numbers: Sequence[int] | IntArray) -> FloatArray:
+        return self._std[len(self.healthy) + np.array(numbers, dtype=np.intp)]
+
+    def _chosen(self, rows: Rows, chosen: Sequence[int], others: IntArray) -> Rows:
+        """Return the rows with a set of faults and its priors, then the columns of others."""
+        n = len(self.healthy)
+        rows = rows.with_columns([*range(n), *(n + k for k in chosen), *(n + others)])
+        prior = np.eye(len(chosen), rows.table.shape[1] - 1, n)
+        return rows + Rows.of(prior, np.zeros(len(chosen)), self._fault_std(chosen))
+
+    def solved(self, chosen: Sequence[int], rows: Rows) -> tuple[GaussianPosterior, FloatArray]:
+        """Return the posterior of the healthy columns and a set of faults, and the SoC with it."""
+        posterior = self._chosen(rows, chosen, np.zeros(0, dtype=np.intp)).posterior()
+        n = len(self.healthy)
+        S = self._S[:, [*range(n), *(n + k for k in chosen)]]
+        return posterior, self._counted_pct + S @ posterior.mean
+
+    def fitted(self, chosen: Sequence[int], rows: Rows, share: float) -> Fitted:
+        """Return the posterior of a set of faults of a probability."""
+        posterior, pack_pct = self.solved(chosen, rows)
+        n, zero = len(self.healthy), len(self.chain.stretches)
+        X = self._S[:, [*range(n), *(n + k for k in chosen)]]
+        X[:, zero] = 1.0
+        units = np.array([self.faults[k].per_unit for k in chosen])
+        functions = slice(zero + 1, zero + 1 + self.chain.functions.number)
+        return Fitted(
+            share=share,
+            faults=tuple(self.faults[k] for k in chosen),
+            size=posterior.mean[n:] * units,
+            std=np.sqrt(np.diag(posterior.covariance)[n:]) * units,
+            pack_pct=pack_pct,
+            soc_pct=pack_pct + posterior.mean[zero],
+            std_pct=posterior.std_of(X),
+            functions=posterior.mean[functions],
+            covariance=posterior.covariance[functions, functions],
+            is_free=self.is_free(chosen),
+        )
+
+    def is_free(self, chosen: Sequence[int]) -> bool:
+        """Return whether a set has a level for the last count of the gauge."""
+        counts = np.flatnonzero(np.isfinite(self.chain.count_pct))
+        levels = [self.faults[k].shown for k in chosen if self.faults[k].place[0] == "level"]
+        return not counts.size or any(np.asarray(shown)[counts[-1]] for shown in levels)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+
+
+def _sum(rows: Sequence[Rows]) -> Rows:
+    table = np.concatenate([each.table for each in rows])
+    return Rows(table, sum(each.log_norm for each in rows)).reduced()
+
+
+def explain(chain: Chain, priors: Priors) -> list[Fitted]:
+    """Return the sets of faults that explain the logs, the most probable first.
+
+    The voltage is linearised at the SoC that it shows itself, with the gauge withheld, and at the
+    published one, so that its curvature accuses no gauge.
+    """
+    withheld = _settled(chain, priors, chain.fitting_pct, [], NoiseSize(1.0, None))
+    published = chain.published_or(chain.fitting_pct)
+    right = _settled(chain, priors, published, [], NoiseSize(1.0, GAUGES[1]))
+    found = [*_explained(chain, priors, withheld), *_explained(chain, priors, right)]
+    log_total = logsumexp([each.log_weight for each in found])
+    kept = []
+    for is_free in (False, True):
+        of = [each for each in found if each.at.is_free(each.faults) == is_free]
+        least = max((each.log_weight for each in of), default=0.0) + np.log(LEAST_SHARE)
+        kept += [each for each in of if each.log_weight >= least]
+    fits = [
+        each.at.fitted(each.faults, each.rows, float(np.exp(each.log_weight - log_total)))
+        for each in kept
+    ]
+    return sorted(fits, key=lambda each: -each.share)
+
+
+class _Weighed(NamedTuple):
+    """A set of faults at a size of the noise, with ln of its weight."""
+
+    log_weight: float
+    faults: tuple[int, ...]
+    rows: Rows
+    at: Linearised
+
+
+def _explained(chain: Chain, priors: Priors, soc_pct: FloatArray) -> list[_Weighed]:
+    """Move from one set of faults to the next better one while there is one.
+
+    Each set is weighed at its own linearisation; its neighbours count with their probabilities.
+    """
+    chosen, soc = frozenset[int](), soc_pct
+    for _ in range(MOST_MOVES):
+        at = Linearised(chain, priors, soc)
+        weights = _neighbourhood(at, sorted(chosen))
+        best = max(weights, key=lambda faults: float(logsumexp(weights[faults])))
+        if best == chosen:
+            break
+        chosen, noise = best, list(at.all_rows)[int(np.argmax(weights[best]))]
+        soc = _settled(chain, priors, soc, sorted(chosen), noise)
+    return [
+        _Weighed(float(weight), tuple(sorted(some)), rows, at)
+        for some, of_noises in weights.items()
+        for rows, weight in zip(at.all_rows.values(), of_noises, strict=True)
+    ]
+
+
+def _neighbourhood(at: Linearised, chosen: Sequence[int]) -> dict[frozenset[int], FloatArray]:
+    """Return ln weights, over the noises, of a set and of all that differ from it by one fault.
+
+    Those of no fault and of one alone are always among them.
+    """
+    found = dict[frozenset[int], FloatArray]()
+    for left in ([], chosen, *([j for j in chosen if j != one] for one in chosen)):
+        base, more = at.log_weights(left)
+        found[frozenset(left)] = base
+        for j in np.flatnonzero(np.isfinite(more).any(axis=0)).tolist():
+            found[frozenset([*left, j])] = more[:, j]
+    return found
+
+
+def _settled(
+    chain: Chain, priors: Priors, soc_pct: FloatArray, chosen: Sequence[int], noise: NoiseSize
+) -> FloatArray:
+    """Return the SoC at which the voltage is linearised: that which follows from it."""
+    soc = soc_pct
+    for _ in range(ITERATIONS):
+        at = Linearised(chain, priors, soc, chosen)
+        _, found = at.solved(range(len(chosen)), at.rows(noise))
+        step = np.clip(found, -3.0, 103.0) - soc
+        if np.abs(step).max() < SETTLED_PCT:
+            break
+        soc = soc + DAMPING * step
+    return soc
