@@ -35,7 +35,7 @@ from cangauge.estimation.counting import (
 from cangauge.estimation.ekf import inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
-from cangauge.estimation.settings import EstimatorSettings, detect_references
+from cangauge.estimation.settings import EstimatorSettings, detect_references, since
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
 from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
@@ -268,10 +268,8 @@ class Estimator:
         self.online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
             self._note_gap(time_s, charge)
-        if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
-            memory.rest_since_s = math.nan
-        elif math.isnan(memory.rest_since_s):
-            memory.rest_since_s = time_s
+        is_rest = abs(current_a) <= REST_CURRENT_C_RATE * self.capacity_ah
+        memory.rest_since_s = since(memory.rest_since_s, is_rest, time_s)
         if charge.seconds > REST_S:
             memory.rest_since_s = time_s - charge.seconds
         tick = math.floor((time_s - memory.first_s) * self.model.rate_hz + 1e-6)
@@ -549,9 +547,10 @@ class Estimator:
             )
         try:
             self._unpack(b64decode(state.block), age_s)
-        except (InputError, ValueError, TypeError, KeyError, IndexError) as error:
+            latest = self.estimate
+        except (InputError, ValueError, TypeError, LookupError) as error:
             raise InputError("damaged, or of another model", field="estimator.block") from error
-        return self.estimate
+        return latest
 
     def start_from(self, soc_pct: float, soc_std_pct: float, away_s: float) -> None:
         """Start from the SoC of an estimator that ended `away_s` ago, and its deviation [%]."""

@@ -99,13 +99,10 @@ def detect_references(
     sample : Sample
         Its voltage may be NaN.
     """
-    found = []
-    full, rest = settings.full_charge, settings.long_rest
+    found, full, rest = [], settings.full_charge, settings.long_rest
     if full is not None and not math.isnan(sample.voltage_v):  # a missing voltage proves nothing
-        if sample.voltage_v < full.voltage_v or abs(sample.current_a) > full.current_a:
-            memory.full_since_s = math.nan
-        elif math.isnan(memory.full_since_s):
-            memory.full_since_s = sample.time_s
+        is_high = sample.voltage_v >= full.voltage_v and abs(sample.current_a) <= full.current_a
+        memory.full_since_s = since(memory.full_since_s, is_high, sample.time_s)
         was, memory.is_full = memory.is_full, sample.time_s - memory.full_since_s >= full.hold_s
         if memory.is_full and not was:
             found.append((full.soc_pct, full.soc_std_pct))
@@ -115,3 +112,10 @@ def detect_references(
         if memory.is_rested and not was:
             found.append((memory.newton_pct, rest.soc_std_pct))
     return found
+
+
+def since(start_s: float, holds: bool, now_s: float) -> float:
+    """Return since when a condition has held [s], given the time so far; NaN: it does not."""
+    if not holds:
+        return math.nan
+    return now_s if math.isnan(start_s) else start_s

@@ -55,6 +55,10 @@ then differs by at most 0.009 % from that with every sample (at 1 s by 0.015 %).
 JITTER: Final = 0.9
 """Part of the period from which a sample is kept: a task's jitter stays within a tenth of it."""
 
+WAITING_AT_LEAST: Final = 130
+"""Samples that a `time_skew` holds beyond those of its time: twice the stale ones that the core
+drops at once (64), and the two of an interpolation."""
+
 GOLDEN_S: Final = 1200.0
 """Duration of the drive of the tests [s]: several times the longest delay of most models."""
 
@@ -110,17 +114,15 @@ def export_c(
         name: shared_file(place, name).read_text(encoding="utf-8")
         for name, place in folders.items()
     }
-    texts["cangauge_config.h"] = head.format("cangauge_config.h") + _config(constants, period_s)
     definition = model_definition("pack_model", constants)
-    texts["pack_model.h"] = head.format("pack_model.h") + _model_header(
-        length, spacing_s, text_sha256(__version__ + definition)
-    )
-    texts["pack_model.c"] = (
-        head.format("pack_model.c")
-        + '#include "pack_model.h"\n\n#include <math.h>\n\n'
-        + definition
-    )
-    texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
+    identity = text_sha256("".join(texts.values()) + definition)
+    made = {
+        "cangauge_config.h": _config(constants, period_s),
+        "pack_model.h": _model_header(length, spacing_s, identity),
+        "pack_model.c": f'#include "pack_model.h"\n\n#include <math.h>\n\n{definition}',
+        "golden.h": _golden(model, period_s),
+    }
+    texts |= {name: head.format(name) + text for name, text in made.items()}
     texts = arranged(platform, texts)
     _refuse_foreign_names(folder, texts)
     try:
@@ -165,8 +167,7 @@ def _comment(text: str) -> str:
 def _config(constants: CoreConstants, period_s: float) -> str:
     """Return the sizes of the structures."""
     of = constants.model
-    skews = [abs(form.values[0]) for form in constants.effects if form.kind == "time_skew"]
-    waiting = math.ceil(max(skews) / period_s) + 130 if skews else 1
+    waiting = math.ceil(abs(of["skew_s"]) / period_s) + WAITING_AT_LEAST if of["skew_s"] else 1
     sizes = {name: of[name] for name in ("delays", "low_passes", "functions", "effects")}
     sizes |= {"knots": max(of["knots"], of["function_knots"]), "waiting": waiting}
     lines = [f"#define CG_{name.upper()} {max(size, 1)}" for name, size in sizes.items()]

@@ -201,30 +201,30 @@ class _Unit:
     kind: Kind
     constants: CoreConstants
     variables: tuple[Variable, ...]
-    parameters: tuple[tuple[int, str], ...]
+    parameters: dict[Variable, tuple[int, str]]
     """Effect and place in C of each parameter of an effect: the last of the variables."""
     token: str
 
     @classmethod
     def of(cls, model: Model, constants: CoreConstants, kind: Kind) -> _Unit:
+        parameters = {}
+        variables = _estimator_variables()
         if kind == "pack":
             forms = [
                 CoreForm("no_effect") if form.kind in SENSORS else form
                 for form in constants.effects
             ]
             constants = replace(constants, effects=forms)
-            names, parameters = _effect_parameters(forms)
-            variables = (*_pack_variables(model), *names)
-        else:
-            parameters, variables = [], _estimator_variables()
+            parameters = _effect_parameters(forms)
+            variables = (*_pack_variables(model), *parameters)
         name = re.sub(r"\W+", "_", f"{kind} {model.name}", flags=re.ASCII).rstrip("_")
         token = hashlib.sha256(f"{kind} {__version__} {model.to_json()}".encode())
         return cls(
             name[:LONGEST_NAME],
             kind,
             constants,
-            tuple(variables),
-            tuple(parameters),
+            variables,
+            parameters,
             token.hexdigest(),
         )
 
@@ -255,7 +255,7 @@ class _Unit:
         ranges = [item.range or (math.nan, math.nan) for item in self.variables]
         start = [0.0 if item.start is None else item.start for item in self.variables]
         first = len(self.variables) - len(self.parameters)
-        table = [[first + k, *where] for k, where in enumerate(self.parameters)]
+        table = [[first + k, *where] for k, where in enumerate(self.parameters.values())]
         return (
             '#include "fmu.h"\n\n'
             f"{model_definition('FMU_MODEL', self.constants)}"
@@ -356,24 +356,22 @@ def _estimator_variables() -> tuple[Variable, ...]:
     )
 
 
-def _effect_parameters(
-    forms: Sequence[CoreForm],
-) -> tuple[list[Variable], list[tuple[int, str]]]:
-    """Return the effects' constants as variables, and the effect and place in C of each."""
-    variables, places = [], []
+def _effect_parameters(forms: Sequence[CoreForm]) -> dict[Variable, tuple[int, str]]:
+    """Return the effects' constants as variables, with effect and place in C of each."""
+    found = {}
     for number, form in enumerate(forms):
-        names = VALUES.get(form.kind, ())
-        values = [
-            *((f"{k}", *pair) for k, pair in enumerate(zip(names, form.values, strict=False))),
-            *((f"CG_VALUES + {k}", f"tau_{k + 1}_s", tau_s) for k, tau_s in enumerate(form.tau_s)),
-        ]
-        for place, name, value in values:
-            text = f"effect {number + 1} of the model, as in cangauge.h"
-            full = f"effect_{number + 1}_{form.kind}.{name}"
-            bounds = TAU_S if name.startswith("tau_") else DIVISORS.get(name, FINITE)
-            variables.append(Variable(full, "parameter", None, value, text, range=bounds))
-            places.append((number, place))
-    return variables, places
+        text = f"effect {number + 1} of the model, as in cangauge.h"
+        prefix = f"effect_{number + 1}_{form.kind}"
+        named = zip(VALUES.get(form.kind, ()), form.values, strict=False)
+        for place, (name, value) in enumerate(named):
+            bounds = DIVISORS.get(name, FINITE)
+            variable = Variable(f"{prefix}.{name}", "parameter", None, value, text, range=bounds)
+            found[variable] = number, f"{place}"
+        for place, value in enumerate(form.tau_s):
+            name = f"{prefix}.tau_{place + 1}_s"
+            variable = Variable(name, "parameter", None, value, text, range=TAU_S)
+            found[variable] = number, f"CG_VALUES + {place}"
+    return found
 
 
 def _compiler() -> list[str]:

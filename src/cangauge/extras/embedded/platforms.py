@@ -113,21 +113,9 @@ void loop()
 """
 
 
-def arranged(platform: Platform, texts: Mapping[str, str]) -> dict[str, str]:
-    """Return the files of an export by their path, as a platform expects them."""
-    if platform == "esp-idf":
-        return {**texts, **_esp_idf()}
-    if platform == "zephyr":
-        return {**texts, **_zephyr()}
-    if platform == "arduino":
-        return _arduino(texts)
-    return dict(texts)
-
-
-def _esp_idf() -> dict[str, str]:
-    sources = " ".join(f'"{name}"' for name in SOURCES)
-    return {
-        "CMakeLists.txt": f'idf_component_register(SRCS {sources} INCLUDE_DIRS ".")\n'
+ADDED: Final = {
+    "esp-idf": {
+        "CMakeLists.txt": f"idf_component_register(SRCS {' '.join(SOURCES)} INCLUDE_DIRS .)\n"
         "target_compile_definitions(${COMPONENT_LIB} PUBLIC CANGAUGE_CONFIG CANGAUGE_REAL=float)\n",
         "idf_component.yml": f'version: "{__version__}"\ndescription: {ABOUT}\n'
         'license: Apache-2.0\ndependencies:\n  idf: ">=4.4"\n',
@@ -136,16 +124,12 @@ def _esp_idf() -> dict[str, str]:
         "include($ENV{IDF_PATH}/tools/cmake/project.cmake)\nproject(gauge)\n",
         "examples/gauge/main/CMakeLists.txt": 'idf_component_register(SRCS "gauge.c")\n',
         "examples/gauge/main/gauge.c": _ESP_MAIN,
-    }
-
-
-def _zephyr() -> dict[str, str]:
-    sources = "\n    ".join(SOURCES)
-    return {
+    },
+    "zephyr": {
         "zephyr/module.yml": "name: cangauge\nbuild:\n  cmake: .\n  kconfig: Kconfig\n",
         "Kconfig": f'config CANGAUGE\n\tbool "{ABOUT}"\n',
         "CMakeLists.txt": "if(CONFIG_CANGAUGE)\n  zephyr_library()\n"
-        f"  zephyr_library_sources(\n    {sources}\n  )\n  zephyr_include_directories(.)\n"
+        f"  zephyr_library_sources({' '.join(SOURCES)})\n  zephyr_include_directories(.)\n"
         "  zephyr_compile_definitions(CANGAUGE_CONFIG CANGAUGE_REAL=float)\nendif()\n",
         "samples/gauge/CMakeLists.txt": "cmake_minimum_required(VERSION 3.20.0)\n"
         "list(APPEND ZEPHYR_EXTRA_MODULES ${CMAKE_CURRENT_SOURCE_DIR}/../..)\n"
@@ -153,7 +137,16 @@ def _zephyr() -> dict[str, str]:
         "target_sources(app PRIVATE src/main.c)\n",
         "samples/gauge/prj.conf": "CONFIG_CANGAUGE=y\n",
         "samples/gauge/src/main.c": _ZEPHYR_MAIN,
-    }
+    },
+}
+"""Platform → files beside the sources."""
+
+
+def arranged(platform: Platform, texts: Mapping[str, str]) -> dict[str, str]:
+    """Return the files of an export by their path, as a platform expects them."""
+    if platform == "arduino":
+        return _arduino(texts)
+    return {**texts, **ADDED.get(platform, {})}
 
 
 def _arduino(texts: Mapping[str, str]) -> dict[str, str]:
