@@ -13,6 +13,7 @@ import gzip
 import hashlib
 import io
 import os
+import re
 import secrets
 import stat
 import zipfile
@@ -140,8 +141,12 @@ def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
         raise _unreadable(error, path) from error
 
 
+_CHINESE: Final = re.compile(rb"(?s)(?=.*[\xa1-\xf7]{4})(?:[\x00-\x7f]|[\xa1-\xf7][\xa1-\xfe])*+")
+"""GB 2312: bytes above ASCII in pairs, and words of two characters or more."""
+
+
 def as_utf8(data: bytes) -> bytes:
-    """Return text of UTF-8, UTF-16 or latin-1 as UTF-8 without a byte order mark."""
+    """Return text of UTF-8, UTF-16, GB 18030 or latin-1 as UTF-8 without a byte order mark."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if data[:2] in _UTF16:
         return data.decode("utf-16", errors="replace").encode()
@@ -155,7 +160,9 @@ def as_utf8(data: bytes) -> bytes:
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
-        return data.decode("latin-1").encode()
+        head = data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1]
+        codec = "gb18030" if _CHINESE.fullmatch(head) else "latin-1"
+        return data.decode(codec, errors="replace").encode()
     return data
 
 

@@ -247,3 +247,20 @@ def test_reader_of_another_package_is_offered_files_first(
     (tmp_path / "mine.txt").write_text("MYLOGGER 1\n" + "".join(rows))
     log = read_log(tmp_path / "mine.txt", temperature_c=20.0)
     np.testing.assert_array_equal(log.current_a, CURRENT_A)
+
+
+def test_influxdb_repeats_its_header_above_each_table(tmp_path: Path) -> None:
+    notes = (
+        "#group,false,false,true,true,true\n#datatype,string,long,dateTime:RFC3339,double,string"
+    )
+    header = f"{notes}\n#default,_result,,,,\n,result,table,_time,_value,_field"
+    series = {"current": lambda k: 10.0 * (k % 2), "voltage": lambda k: 380.0 - k % 2}
+    blocks = [
+        "\n".join([header, *(f",,0,2024-03-13T12:00:{k:02d}Z,{of(k)},{name}" for k in range(60))])
+        for name, of in series.items()
+    ]
+    path = tmp_path / "query.csv"
+    path.write_text("\n\n".join([*blocks, ""]), encoding="utf-8")
+    log = read_log(path, temperature_c=20.0)
+    np.testing.assert_array_equal(log.current_a, [10.0 * (k % 2) for k in range(60)])
+    np.testing.assert_array_equal(log.voltage_v, [380.0 - k % 2 for k in range(60)])

@@ -35,13 +35,10 @@ from cangauge.errors import InputError, require_temperature
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log
+from cangauge.logs.quantities import known_temperature_source
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import (
-    WRAPPED,
-    known_temperature_source,
-    refuse_wrong_units,
-)
+from cangauge.logs.wrong_units import WRAPPED, refuse_wrong_units
 from cangauge.settings import TemperatureSource, TimeSourceName
 from cangauge.types import Sample
 

@@ -32,7 +32,7 @@ from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest, require_temperature
-from cangauge.logs.units import convert
+from cangauge.logs.quantities import convert
 from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource
 
 _T = TypeVar("_T")

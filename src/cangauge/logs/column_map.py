@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from cangauge.errors import InputError
-from cangauge.logs.units import FIELDS
+from cangauge.logs.quantities import FIELDS
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""

@@ -11,7 +11,7 @@ from typing import Final
 from cangauge.errors import InputError, closest
 from cangauge.logs.column_map import DOCS, SYNTAX, ColumnMap, meant_by
 from cangauge.logs.headings import Meaning, Rank, meaning_of, names_and_units
-from cangauge.logs.units import CANONICAL_UNIT, FIELDS, REQUIRED, unit_of
+from cangauge.logs.quantities import FIELDS, QUANTITIES, REQUIRED, unit_of
 from cangauge.settings import TemperatureSource
 
 NEEDED: Final = ("time", "current", "voltage")
@@ -136,7 +136,7 @@ def choose_columns(
 def _canonical(headings: Sequence[str]) -> Choice:
     names = [_simple(heading) for heading in headings]
     chosen = {
-        quantity: ChosenColumn((names.index(name),), CANONICAL_UNIT[quantity])
+        quantity: ChosenColumn((names.index(name),), QUANTITIES[quantity].unit)
         for quantity, name in FIELDS.items()
         if name in names
     }

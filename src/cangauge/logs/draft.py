@@ -15,8 +15,9 @@ from cangauge.logs.charge import with_own_count
 from cangauge.logs.columns import shown_headings
 from cangauge.logs.headings import Rank, cell_number, meaning_of
 from cangauge.logs.log import Log
+from cangauge.logs.quantities import REQUIRED, known_temperature_source
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import REQUIRED, known_temperature_source, refuse_wrong_units
+from cangauge.logs.wrong_units import refuse_wrong_units
 from cangauge.settings import TemperatureSource
 from cangauge.types import SOC_WITHIN_PCT
 
@@ -200,7 +201,11 @@ class DraftLog:
         if count > MAX_INCOMPLETE * incomplete.size:
             name = next(name for name, rows in lacks.items() if rows[row])
             problem = f"{count} of {incomplete.size} rows lack {lacking}"
-            raise self.error(name, problem, f"check the export: the first is row {row + 1}")
+            cure = f"check the export: the first is row {row + 1}"
+            if self.in_seconds is None:  # values hold for a second where rows hold only changes
+                option = f"--columns 'time={self.labels['time_s']}[ms]'"
+                cure += f"; if its time is in milliseconds, state it: {option}"
+            raise self.error(name, problem, cure)
         self.keep(~incomplete, f"without {lacking} dropped (the first is row {row + 1})")
 
     def _drop_repeated(self) -> None:

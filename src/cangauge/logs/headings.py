@@ -3,20 +3,18 @@
 A heading is *plain* if its words name a quantity and nothing contradicts it: `Time [s]`,
 `Pack Current (A)`, `Ecell/V`, `Spannung [mV]`, `v.b.soc`. Words that make it another quantity
 (`Step Time`, `Max Cell Voltage`, `Motor Current`) exclude it; words that are not known leave it to
-the user. The words are those of `headings.toml`.
+the user. The words are those of `quantities.toml`.
 """
 
 from __future__ import annotations
 
 import re
-import tomllib
 import unicodedata
 from enum import IntEnum
 from functools import lru_cache
-from pathlib import Path
 from typing import Final, NamedTuple
 
-from cangauge.logs.units import CANONICAL_UNIT, FIELDS, FOREIGN_UNITS, unit_of
+from cangauge.logs.quantities import QUANTITIES, WORDS
 from cangauge.settings import TemperatureSource
 
 LONGEST: Final = 200
@@ -40,8 +38,21 @@ _CELL_VOLTAGE: Final = re.compile(
     r"[\s_]*(?:voltage|volts?)?[\s_]*[\[(]?(?P<unit>m?v)?[\])]?",
     re.IGNORECASE,
 )
-_LETTERS: Final = {"i": "current", "u": "voltage", "v": "voltage", "e": "voltage", "t": "time"}
-"""Quantities by their letter in formulas; a `T` is a temperature."""
+_LETTERS: Final = {
+    letter: name for name, quantity in QUANTITIES.items() for letter in quantity.letters
+}
+_PHRASES: Final = [
+    (f" {phrase} ", f" {min(quantity.words)} ")
+    for quantity in QUANTITIES.values()
+    for phrase in quantity.phrases
+]
+_SOURCES: Final[dict[TemperatureSource, str]] = {"cell": "cell", "room": "ambient", "pack": "pack"}
+"""Words that tell where a temperature is measured."""
+_UNKNOWN: Final[TemperatureSource] = "unknown"
+_NO_UNITS: Final = frozenset({"1", "-", "d"})
+"""Units that end a heading as other than a unit: `Sensor 1`."""
+_CLOCK: Final = re.compile(r"h+\s*:\s*m", re.IGNORECASE)
+"""What a heading of clock times has in place of a unit."""
 
 
 class Rank(IntEnum):
@@ -70,20 +81,7 @@ class Meaning(NamedTuple):
     unit: str
     rank: Rank
     numbered: bool = False
-    source: TemperatureSource = "unknown"
-
-
-def _vocabulary() -> tuple[dict[str, frozenset[str]], dict[str, frozenset[str]]]:
-    """Return the words of `headings.toml`: of quantities, and what others say of one."""
-    text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    quantities, qualifiers = (
-        {name: frozenset(words.split()) for name, words in table.items()}
-        for table in tomllib.loads(text).values()
-    )
-    return quantities, qualifiers
-
-
-_QUANTITIES, _SAYS = _vocabulary()
+    source: TemperatureSource = _UNKNOWN
 
 
 @lru_cache(maxsize=1 << 16)
@@ -94,13 +92,14 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.
     heading = re.sub(r"\\[^\[(]*", "", heading.rpartition("::")[2])
     times = _TIMES.search(heading)
-    if times is None:
-        return _first_meaning(names_and_units(heading, unit_below))
-    found = meaning_of(heading.replace(times[0], " "), unit_below)
-    if found is None:
-        return None
-    unit = found.unit or CANONICAL_UNIT[found.quantity]
-    return found._replace(unit=f"{1.0 / float(times[1]):g}{unit}")
+    if times is not None:
+        found = meaning_of(heading.replace(times[0], " "), unit_below)
+        if found is None:
+            return None
+        unit = found.unit or QUANTITIES[found.quantity].unit
+        return found._replace(unit=f"{1.0 / float(times[1]):g}{unit}")
+    meanings = (_meaning(name, unit) for name, unit in names_and_units(heading, unit_below))
+    return next((meaning for meaning in meanings if meaning is not None), None)
 
 
 def cell_number(heading: str) -> tuple[int, float] | None:
@@ -118,14 +117,14 @@ def charge_scale(heading: str, unit_below: str = "") -> float | None:
     words = _words_of(heading) if len(heading) <= LONGEST else []
     if "mah" in units or "mah" in words:
         return 1e-3
-    is_count = "ah" in units or not _SAYS["charge"].isdisjoint(words)
+    is_count = "ah" in units or not WORDS["charge"].isdisjoint(words)
     return 1.0 if is_count or ("amp" in words and "hours" in words) else None
 
 
 def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]:
     """Return (name, unit) as a heading may be meant, the most explicit first, the whole last."""
     heading = heading.strip()
-    if heading.lower() in _SAYS["degrees"] or heading.lower() == "millis":
+    if heading.lower() in WORDS["degrees"] or heading.lower() == "millis":
         return [("", heading)]
     if len(heading) > LONGEST:
         return [(heading, "")]
@@ -142,14 +141,19 @@ def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]
 
 
 def _is_unit(text: str) -> bool:
-    if text.lower() in FOREIGN_UNITS:
+    if text.lower() in WORDS["foreign_units"]:
         return True
-    return text not in {"1", "-", "d"} and any(unit_of(field, text) for field in FIELDS.values())
+    return text not in _NO_UNITS and any(each.scale_of(text) for each in QUANTITIES.values())
 
 
-def _first_meaning(readings: list[tuple[str, str]]) -> Meaning | None:
-    meanings = (_meaning(name, unit) for name, unit in readings)
-    return next((meaning for meaning in meanings if meaning is not None), None)
+def _words_of(name: str) -> list[str]:
+    """Return the words of a name in lower case, without accents; a phrase as one word."""
+    plain = unicodedata.normalize("NFKD", name)
+    letters = (char for char in plain if not unicodedata.combining(char))
+    text = f" {' '.join(_TOKEN.findall(''.join(letters)))} ".lower()
+    for phrase, word in _PHRASES:
+        text = text.replace(phrase, word)
+    return text.split()
 
 
 def _meaning(name: str, unit: str) -> Meaning | None:
@@ -160,165 +164,124 @@ def _meaning(name: str, unit: str) -> Meaning | None:
         return None
     others = _others(words, quantity, unit)
     if quantity == "time":
-        if re.match(r"h+\s*:\s*m", unit, re.IGNORECASE):
+        if _CLOCK.match(unit):
             unit = ""
-        ticks = [word for word in others if word in _SAYS["ticks"]]
+        ticks = [word for word in others if word in WORDS["ticks"]]
         if ticks and not unit:  # TimeUS
             unit = ticks[-1]
             others = [word for word in others if word != unit]
-    if unit and unit_of(FIELDS[quantity], unit) is None:
+    if unit and QUANTITIES[quantity].scale_of(unit) is None:
         return None
-    in_brackets = re.findall(r"[\[(]([^\[\]()]*)[\])]", name) + name.split("/")[1:]
-    if not unit and any(_is_unit(text.strip().lower()) for text in in_brackets if text.strip()):
+    in_name = re.findall(r"[\[(]([^\[\]()]*)[\])]", name) + name.split("/")[1:]
+    if not unit and any(_is_unit(text.strip().lower()) for text in in_name if text.strip()):
         return None  # of another quantity
     if quantity == "time":
-        is_by_tick = bool(ticks) and _QUANTITIES["time"].isdisjoint(words)  # ms_today
+        is_by_tick = bool(ticks) and QUANTITIES["time"].words.isdisjoint(words)  # ms_today
         return Meaning(quantity, unit, Rank.GUESS if is_by_tick else _rank_of_time(set(others)))
-    if quantity == "temperature":
-        return _temperature(set(others), unit)
-    return _of_pack(quantity, set(others), unit)
-
-
-def _words_of(name: str) -> list[str]:
-    """Return the words of a name in lower case, without accents."""
-    plain = unicodedata.normalize("NFKD", name)
-    letters = (char for char in plain if not unicodedata.combining(char))
-    return [word.lower() for word in _TOKEN.findall("".join(letters))]
+    return _measured(quantity, unit, set(others))
 
 
 def _quantity(words: list[str], name: str, unit: str) -> str | None:
     """Return the quantity that words name, or a unit or letter where no word does."""
-    if _soc_phrase(words):
-        return "soc"
-    if "temps" in words and unit_of("time_s", unit):  # French
-        return "time"
-    if "vol" in words and unit_of("voltage_v", unit):
-        return "voltage"
-    named = {quantity for quantity, known in _QUANTITIES.items() if known.intersection(words)}
+    by_unit = [each for each, quantity in QUANTITIES.items() if unit and quantity.scale_of(unit)]
+    for each in by_unit:
+        if not QUANTITIES[each].words_with_unit.isdisjoint(words):
+            return each
+    named = {each for each, quantity in QUANTITIES.items() if not quantity.words.isdisjoint(words)}
     if len(named) > 1 and "current" in words:  # also an adjective
         named.discard("current")
     if len(named) > 1:
         named.discard("time")  # the instant of anything
     if named:
         return named.pop() if len(named) == 1 else None
-    is_duration = bool(words and unit and unit_of("time_s", unit))
-    if words == ["utc"] or (is_duration and _SAYS["elapsed"].issuperset(words)):
+    return _quantity_of_unit(words, unit, by_unit) or _quantity_of_letter(words, name, unit)
+
+
+def _quantity_of_unit(words: list[str], unit: str, by_unit: list[str]) -> str | None:
+    """Return the quantity of a unit alone, or with words for the pack or of a duration."""
+    if unit.lower() in WORDS["degrees"]:
+        return "temperature"
+    if "time" in by_unit and WORDS["elapsed"].issuperset(words):
         return "time"
-    return _quantity_of_letter(words, name, unit)
-
-
-def _soc_phrase(words: list[str]) -> str:
-    text = " ".join(words)
-    phrases = ("state of charge", "charge level", "battery level")
-    return next((phrase for phrase in phrases if phrase in text), "")
+    is_of_pack = bool(words) and WORDS["pack"].issuperset(words)
+    if is_of_pack and (len(unit) > 1 or unit == "%"):  # `pack_mv`; `Battery A` is one of several
+        return next((each for each in by_unit if each != "time"), None)
+    return None
 
 
 def _quantity_of_letter(words: list[str], name: str, unit: str) -> str | None:
-    """Return the quantity of a unit, or of a formula letter alone or with a word for the pack."""
-    if unit.lower() in _SAYS["degrees"]:
-        return "temperature"
-    if not name and unit:
-        return "time"
+    """Return the quantity of a formula's letter, alone or with words for the pack, or of ticks."""
     letters = [word for word in words if word in _LETTERS]
-    others = [word for word in words if word not in _LETTERS]
-    plain = _SAYS["pack"] | _SAYS["cell"] | _SAYS["display"] | {"avg", "average", "mean"}
-    if len(letters) == 1 and all(word in plain or word.isdigit() for word in others):
+    others = {word for word in words if word not in _LETTERS and not word.isdigit()}
+    plain = WORDS["pack"] | WORDS["cell"] | WORDS["display"] | {"avg", "average", "mean"}
+    is_last_of_pack = len(words) > 1 and words[-1] in _LETTERS and words[-2] in WORDS["pack"]
+    if len(letters) == 1 and (plain >= others or is_last_of_pack):
         if letters != ["t"]:
             return _LETTERS[letters[0]]
-        is_time = bool(unit_of("time_s", unit)) if unit else name.strip() == "t"
+        is_time = bool(QUANTITIES["time"].scale_of(unit)) if unit else name.strip() == "t"
         return "time" if is_time else "temperature"
-    if not unit and _SAYS["ticks"].intersection(words):  # ms_today
-        return "time"
-    return None
+    return "time" if not unit and WORDS["ticks"].intersection(words) else None  # ms_today
 
 
 def _others(words: list[str], quantity: str, unit: str) -> list[str]:
     """Return the words beside those that name the quantity."""
-    phrase = _soc_phrase(words)
-    if phrase:
-        return " ".join(words).replace(phrase, "").split()
-    names = set(_QUANTITIES[quantity])
-    if unit_of(FIELDS[quantity], unit):
-        names |= {"temps", "vol"}
-    if not names.intersection(words):
+    of = QUANTITIES[quantity]
+    names = of.words | (of.words_with_unit if of.scale_of(unit) else frozenset())
+    if names.isdisjoint(words):
         return [word for word in words if word not in _LETTERS]
-    is_date = _SAYS["date"].issuperset(words)
+    is_date = WORDS["date"].issuperset(words)
     return ["(date)"] if is_date else [word for word in words if word not in names]
 
 
 def _rank_of_time(words: set[str]) -> Rank:
-    if words & (_SAYS["other"] | _SAYS["extreme"] | _SAYS["other_time"]):
+    if words & (WORDS["other"] | WORDS["extreme"] | WORDS["other_time"]):
         return Rank.GUESS
-    if words & _SAYS["elapsed"]:
+    if words & WORDS["elapsed"]:
         return Rank.DIRECT
-    if words - _SAYS["neutral"] - {"(date)"}:
+    if words - WORDS["neutral"] - {"(date)"}:
         return Rank.PART
     return Rank.DERIVED if "(date)" in words else Rank.PLAIN
 
 
-def _of_pack(quantity: str, words: set[str], unit: str) -> Meaning:
-    """Return the meaning of a current, voltage or SoC with these other words."""
+def _measured(quantity: str, unit: str, words: set[str]) -> Meaning:
+    """Return the meaning of a measured value with these other words."""
     named = {word for word in words if not word.isdigit()}
     is_numbered = len(named) < len(words)
-    is_of_pack = bool(named & _SAYS["pack"])
-    known = ("pack", "neutral", "cell", "display")
-    has_unknown = bool(named.difference(*(_SAYS[each] for each in known)))
-    if named & (_SAYS["other"] | _SAYS["extreme"]) or "12" in words:
-        rank = Rank.OTHER
-    elif (
-        named & _SAYS["ambient"]
-        or (has_unknown and not is_of_pack)
-        or (is_numbered and not is_of_pack and "1" not in words)
-    ):
-        rank = Rank.GUESS
-    elif has_unknown or is_numbered:
-        rank = Rank.PART
-    elif named & (_SAYS["cell"] | _SAYS["display"] | _SAYS["derived"]):
-        rank = Rank.DERIVED
-    elif is_of_pack:
-        rank = Rank.DIRECT
-    else:
-        rank = Rank.PLAIN if named else Rank.BARE
-    return Meaning(quantity, unit, rank, is_numbered)
-
-
-def _source(named: set[str]) -> TemperatureSource:
-    """Return where a temperature is measured."""
-    if named & _SAYS["cell"]:
-        return "cell"
-    if named & _SAYS["ambient"]:
-        return "room"
-    return "pack" if named & _SAYS["pack"] else "unknown"
-
-
-def _temperature(words: set[str], unit: str) -> Meaning:
-    """Return the meaning of a temperature with these other words: of a probe, or of the room."""
-    named = {word for word in words if not word.isdigit()}
-    is_numbered = len(named) < len(words)
-    source = _source(named)
-    named -= _SAYS["probe"]
-    if named & _SAYS["auxiliary"]:  # a cycler's thermocouple
-        named = named - _SAYS["auxiliary"] | {"battery"}
+    if quantity != "temperature":
+        is_other = "12" in words or bool(named & WORDS["extreme"])
+        is_vague = is_numbered and "1" not in words
+        rank = Rank.OTHER if is_other else _rank(named, is_part=is_numbered, is_vague=is_vague)
+        return Meaning(quantity, unit, Rank.GUESS if rank is Rank.AMBIENT else rank, is_numbered)
+    sources = (place for place, group in _SOURCES.items() if named & WORDS[group])
+    source = next(sources, _UNKNOWN)
+    named -= WORDS["probe"]
+    if named & WORDS["auxiliary"]:
+        named = named - WORDS["auxiliary"] | {"battery"}
         is_numbered = True
-    is_extreme = bool(named & _SAYS["extreme"])
-    if is_extreme:  # the hottest and the coldest probe
-        named -= _SAYS["extreme"]
-        is_numbered = True
-    is_of_pack = bool(named & _SAYS["pack"])
-    known = ("pack", "neutral", "cell", "display", "ambient")
-    has_unknown = bool(named.difference(*(_SAYS[each] for each in known)))
-    if named & _SAYS["other"] or "12" in words:
-        rank = Rank.OTHER
-    elif named & _SAYS["ambient"]:
-        rank = Rank.AMBIENT
-    elif not is_of_pack and (has_unknown or (is_extreme and not named & _SAYS["cell"])):
-        rank = Rank.GUESS
-    elif has_unknown or is_extreme:
-        rank = Rank.PART
-    elif named & (_SAYS["cell"] | _SAYS["display"]):
-        rank = Rank.DERIVED
-    elif is_of_pack:
-        rank = Rank.DIRECT
-    else:
-        rank = Rank.PLAIN
-    return Meaning("temperature", unit, rank, is_numbered, source)
+    is_extreme = bool(named & WORDS["extreme"])
+    named -= WORDS["extreme"]
+    is_vague = is_extreme and not named & WORDS["cell"]
+    rank = Rank.OTHER if "12" in words else _rank(named, is_part=is_extreme, is_vague=is_vague)
+    return Meaning(quantity, unit, rank, is_numbered or is_extreme, source)
+
+
+def _rank(named: set[str], *, is_part: bool, is_vague: bool) -> Rank:
+    """Return the rank by the other words of a heading.
+
+    `is_part`: one of several values of the pack. `is_vague`: of which only a word for the pack says
+    that it is the pack's.
+    """
+    known = WORDS["pack"] | WORDS["neutral"] | WORDS["cell"] | WORDS["display"] | WORDS["ambient"]
+    is_of_pack = bool(named & WORDS["pack"])
+    has_unknown = bool(named - known)
+    is_derived = bool(named & (WORDS["cell"] | WORDS["display"] | WORDS["derived"]))
+    ranks = (
+        (bool(named & WORDS["other"]), Rank.OTHER),
+        (bool(named & WORDS["ambient"]), Rank.AMBIENT),
+        (not is_of_pack and (has_unknown or is_vague), Rank.GUESS),
+        (has_unknown or is_part, Rank.PART),
+        (is_derived, Rank.DERIVED),
+        (is_of_pack, Rank.DIRECT),
+        (bool(named), Rank.PLAIN),
+    )
+    return next((rank for holds, rank in ranks if holds), Rank.BARE)

@@ -15,7 +15,7 @@ from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError, naming_arguments, require_temperature
-from cangauge.logs.units import REQUIRED
+from cangauge.logs.quantities import REQUIRED
 from cangauge.settings import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.types import SOC_WITHIN_PCT
 

@@ -10,7 +10,7 @@ from cangauge._files import Head
 from cangauge.errors import InputError
 from cangauge.logs.column_map import DOCS, ColumnMap
 from cangauge.logs.columns import NEEDED, UnknownColumnsError
-from cangauge.logs.units import FIELDS
+from cangauge.logs.quantities import FIELDS
 
 _TRIALS: Final = 24
 """Most proposals that are tried [-]: each reads the beginning of the file."""

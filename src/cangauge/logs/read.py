@@ -23,8 +23,9 @@ from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.proposals import Beginning, proposing
+from cangauge.logs.quantities import FIELDS
 from cangauge.logs.table import ArrowTable, draft_of_table
-from cangauge.logs.text import TextTable, find_table, likely_header
+from cangauge.logs.text import TextTable, find_table, likely_header, without_header
 from cangauge.logs.values import numbers_of, with_decimal_points
 from cangauge.settings import TemperatureSource
 
@@ -208,6 +209,12 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
         unknown = UnknownColumnsError(str(head.path), headings, choice, None)
         error = proposing(unknown, partial(file.reads, LogTableReader()))
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
+    bare = without_header(head)
+    if bare is not None and not headings:
+        problem, count = f"{problem}: a table without a header", len(bare.headings)
+        named = ",".join(f"{name}=#{k}" for k, name in enumerate([*FIELDS][:count], start=1))
+        cure = f"name its {count} columns by number, such as --columns '{named}' ({DOCS})"
+        return InputError(problem, source=head.path, cure=cure)
     shown = head.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
     field, value = ("first line", shown[:80]) if is_text else (None, None)

@@ -17,8 +17,8 @@ import pyarrow.compute as pc
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.units import unit_of
-from cangauge.logs.values import first_text, is_number, is_text, numbers_of, present
+from cangauge.logs.quantities import unit_of
+from cangauge.logs.values import first_text, is_number, is_text, numbers_of, present, unit_in_cell
 
 _CLOCK: Final = (
     r"(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
@@ -27,7 +27,10 @@ _CLOCK: Final = (
 _DATE: Final = (
     r"(?:[A-Za-z]{3},?\s+)?(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|[A-Za-z]{3})[-/.](?P<c>\d{1,4})"
 )
-_ZONE: Final = r"(?P<z>Z|z|UTC|GMT|(?P<sign>[+-])(?P<zh>\d{2}):?(?P<zm>\d{2})?)?"
+# Of zones only UTC is known by name: `CEST` is local time, `CEST+0200` is not.
+_ZONE: Final = (
+    r"(?:(?P<z>Z|z|UTC|GMT)|[A-Z]{3,5})?\s*(?:(?P<sign>[+-])(?P<zh>\d{2}):?(?P<zm>\d{2})?)?"
+)
 _DATE_TIME: Final = rf"^{_DATE}(?:(?:[T,_]|\s)\s*{_CLOCK})?\s*{_ZONE}$"
 _CLOCK_TIME: Final = rf"^(?:(?P<d>\d+)\s*(?:[dD]|[dD]ays?)?\s+)?{_CLOCK}$"
 _SPELLINGS: Final = (
@@ -38,6 +41,11 @@ _SPELLINGS: Final = (
         r"\2-\1-\3 ",
     ),
     (r"^(\d{1,2})\.?\s+([A-Za-z]{3})[a-z]*\.?,?\s+(\d{4}),?\s*", r"\1-\2-\3 "),
+    # `Wed Mar 13 23:50:00 GMT+01:00 2024`, as C and Java write it.
+    (
+        r"^[A-Za-z]{3} ([A-Za-z]{3}) +(\d{1,2}) (\d{1,2}:\d{2}:\d{2}) (?:(\S+) )?(\d{4})$",
+        r"\2-\1-\5 \3 \4",
+    ),
     # `20240313T235000Z`, `240313235000`; days and a clock time: `1.23:50:00`, `073:23:50:00`.
     (r"^(\d{4})(\d{2})(\d{2})T?(\d{2})(\d{2})(\d{2})([Z.,]|$)", r"\1-\2-\3 \4:\5:\6\7"),
     (r"^(\d{2})(\d{2})(\d{2})(\d{2})(\d{2})(\d{2})$", r"20\1-\2-\3 \4:\5:\6"),
@@ -132,13 +140,16 @@ def seconds_of(
     if pa.types.is_date(kind):
         column = column.cast(pa.string())
     cells = present(column) if is_text(column) else None
-    if cells is not None and not is_number(first_text(cells) or "0"):
+    first = "0" if cells is None else first_text(cells)
+    has_unit = unit_of("time_s", unit_in_cell(first)) is not None
+    if cells is not None and not is_number(first or "0") and not has_unit:
         return seconds_of_text(cells, order_or_zone, source, label)
-    values, _ = numbers_of(column, source, label)
+    values, in_cells = numbers_of(column, source, label)
     digits = _spelled_in_digits(values) if not unit or is_format else None
     if digits is not None:
         return seconds_of_text(digits, order_or_zone, source, label)
-    return _seconds_of_numbers(values * factor, "" if is_format else unit, source, label)
+    unit = "" if is_format else unit
+    return _seconds_of_numbers(values * factor, unit or in_cells, source, label)
 
 
 def _zone_of(name: str) -> ZoneInfo | None:
@@ -251,7 +262,7 @@ def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str
     values = np.full(known.size, np.nan)
     values[known] = _day_numbers(fields[:, known], order) * 86400.0
     values += of_day_s
-    if np.any(_words(parts, "z") != ""):
+    if np.any(_words(parts, "z") + _words(parts, "sign") != ""):
         hours, minutes = (np.nan_to_num(_numbers(parts, name)) for name in ("zh", "zm"))
         sign = np.where(_words(parts, "sign") == "-", -1.0, 1.0)
         return values - sign * (hours * 3600.0 + minutes * 60.0), f"date{how} with zone"

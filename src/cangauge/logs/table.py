@@ -31,16 +31,16 @@ from cangauge.logs.columns import (
 )
 from cangauge.logs.draft import COUNTER, MAX_INCOMPLETE, DraftLog
 from cangauge.logs.headings import Rank, charge_scale
-from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
-from cangauge.logs.text import TextTable
-from cangauge.logs.units import (
-    CANONICAL_UNIT,
+from cangauge.logs.quantities import (
     FIELDS,
+    QUANTITIES,
     REQUIRED,
     convert,
     known_temperature_source,
     unit_of,
 )
+from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
+from cangauge.logs.text import TextTable
 from cangauge.logs.values import first_text, is_number, numbers_of, present, with_decimal_points
 
 MAX_COUNTERS: Final = 6
@@ -177,7 +177,7 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
             raise draft.error(name, problem, cure, f"{in_cells}, heading {unit}")
         unit = unit or in_cells
     parts = [numbers * column.factor for numbers, _ in read]
-    shown = unit or f"{CANONICAL_UNIT[quantity]}, assumed"
+    shown = unit or f"{QUANTITIES[quantity].unit}, assumed"
     if quantity == "soc":
         finite = parts[0][np.isfinite(parts[0])]
         is_fraction = np.any(finite % 1.0) and finite.min() >= 0.0 and finite.max() <= 1.0

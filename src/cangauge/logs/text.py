@@ -21,9 +21,9 @@ from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
+from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps, is_stamp
-from cangauge.logs.units import FIELDS, unit_of
-from cangauge.logs.values import MISSING, is_bare, is_number, is_spelled, is_text
+from cangauge.logs.values import MISSING, is_bare, is_number, is_spelled, is_text, unit_in_cell
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
@@ -58,7 +58,7 @@ class TextTable(NamedTuple):
             If there is no row, or a row in the middle has the wrong number of cells.
         """
         data = as_utf8(self.head.read())
-        width = self._width()
+        width = self._width(places)
         kinds = self._kinds(places)
         try:
             table, odd_rows = self._read(data, width, kinds)
@@ -131,14 +131,14 @@ class TextTable(NamedTuple):
         is_heading = pc.equal(pc.utf8_trim_whitespace(cells), heading)
         return pc.if_else(is_heading, None, cells) if pc.any(is_heading).as_py() else cells
 
-    def _width(self) -> int:
-        """Return the number of cells of the first row: headers can be shorter than rows."""
+    def _width(self, places: Sequence[int]) -> int:
+        """Return the number of cells of the first row, which may be another than the header's."""
         first = next((line for line in self.head.lines[self.skip_lines :] if line.strip()), "")
         if not first:
             raise self._error("there are no rows below the header", "check the export")
         width = len(split_cells(first, self.delimiter))
-        named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
-        if not named <= width <= MAX_COLUMNS:
+        if not max(places) < width <= MAX_COLUMNS:
+            named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
             problem = f"row 1 has {width} cells where the header has {named}"
             cure = "the file looks cut off or has another delimiter: export it again"
             raise self._error(f"{problem} (at most {MAX_COLUMNS})", cure)
@@ -175,7 +175,7 @@ def _first_value(rows: Sequence[Sequence[str]], place: int) -> str:
 
 
 def _is_value(cell: str) -> bool:
-    return is_number(cell) or is_stamp(cell)
+    return is_number(cell) or is_stamp(cell) or bool(unit_in_cell(cell))
 
 
 def _values_in(cells: Sequence[str]) -> int:
@@ -187,7 +187,7 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None."""
     texts = given.texts.values() if given else ()
     if texts and all(text.startswith("#") for text in texts):
-        bare = _without_header(head)
+        bare = without_header(head)
         if bare is not None:
             return bare
     canonical = None
@@ -242,7 +242,7 @@ def _repeats_units(row: Sequence[str], choice: Choice) -> bool:
     return bool(cells) and all(is_unit)
 
 
-def _without_header(head: Head) -> TextTable | None:
+def without_header(head: Head) -> TextTable | None:
     """Return the table of a text that has no header, for columns given by number."""
     for number, delimiter in product(range(len(head.lines)), _DELIMITERS):
         cells = split_cells(head.lines[number], delimiter)

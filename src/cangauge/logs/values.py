@@ -22,6 +22,8 @@ _NUMBER: Final = r"^[-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?\s*\D{0,4}$"
 _SPELLINGS: Final = (("[\u2212\u2013]", "-"), ("['\u2019\u00a0\u202f](\\d{3})", r"\1"))
 """A typographic minus; 1'800."""
 _THOUSANDS: Final = r"^[-+]?[1-9]\d{{0,2}}(?:[{}]\d{{3}})+\D{{0,5}}$"
+_DATE: Final = re.compile(r"\d{1,4}\.\d{1,2}\.\d{1,4}")
+"""`13.03.2024` has no decimal mark."""
 _MARKS: Final = {",": ".", ".": ","}
 """What separates decimals, and what then may separate thousands."""
 
@@ -108,7 +110,8 @@ def with_decimal_points(columns: Mapping[int, Any]) -> dict[int, Any]:
             cells = column.cast(pa.string())
             for pattern, replacement in _SPELLINGS:
                 cells = pc.replace_substring_regex(cells, pattern, replacement)
-            if re.match(_NUMBER, first_text(present(cells))):
+            first = first_text(present(cells))
+            if re.match(_NUMBER, first) and not _DATE.fullmatch(first):
                 texts[place] = cells
     if not any(_any(cells, ",") for cells in texts.values()):
         return {**columns, **texts}
@@ -133,6 +136,12 @@ def _odd(cells: Any, pattern: str, mark: str) -> bool:
     has_mark = pc.match_substring_regex(cells, pattern.format(mark))
     fits = pc.match_substring_regex(cells, _THOUSANDS.format(mark))
     return bool(pc.any(pc.and_not(has_mark, fits)).as_py())
+
+
+def unit_in_cell(text: str) -> str:
+    """Return the unit of a number in a cell (`5 sec`), "" without any."""
+    match = re.match(_WITH_UNIT, text)
+    return match["unit"].strip() if match else ""
 
 
 def _without_unit(cells: Any) -> tuple[Any, str]:

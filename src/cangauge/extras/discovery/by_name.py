@@ -28,8 +28,8 @@ from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate, range_text
 from cangauge.extras.discovery.fields import LEAST_BITS
 from cangauge.extras.discovery.pairs import FEW_MOVES
+from cangauge.logs.quantities import unit_of
 from cangauge.logs.sign import correlation
-from cangauge.logs.units import unit_of
 
 
 def _words(text: str) -> frozenset[str]:

@@ -17,8 +17,8 @@ from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import shown_headings
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import LONGEST
+from cangauge.logs.quantities import REQUIRED, convert
 from cangauge.logs.text import TextTable, split_cells
-from cangauge.logs.units import REQUIRED, convert
 from cangauge.logs.values import numbers_of
 
 # One heading of the i3 trips misspells the unit's bracket: `max. SoC [%)`; D3's units follow `__`.

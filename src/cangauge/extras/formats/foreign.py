@@ -68,6 +68,11 @@ _FORMATS: Final = (
         "a log of ESPHome",
         "read the sensors from the history of Home Assistant or of InfluxDB, as CSV",
     ),
+    (
+        rb"[^\s=]+(,[^\s=]+=\S+)? [^\s=]+=\S+( \d+)?\r?\n",
+        "InfluxDB's line protocol",
+        "export it from InfluxDB as CSV: influx query --raw, or influx -format csv",
+    ),
     # Captures
     (
         rb" *\([\d.]+\) +\S+ +[0-9A-F]+ +\[\d+\].*::",

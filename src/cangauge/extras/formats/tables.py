@@ -186,13 +186,14 @@ class LongTable:
         named = [place for place, name in enumerate(lower) if name in self._NAMES]
         units = [place for place, name in enumerate(lower) if name in self._UNITS]
         time = text.headings.index(_time_of(text))
-        cells = text.columns([value, time, *named, *units])
-        # Words ("unavailable") end a value; headers are repeated for each table.
+        cells = text.columns([0, value, time, *named, *units])
+        # Words ("unavailable") end a value. Headers and InfluxDB's notes stand above each table.
         values = _as_numbers(cells[value])
-        is_header = pc.equal(cells[time].cast(pa.string()), text.headings[time])
+        is_header = pc.equal(_text_of(cells[time]), text.headings[time])
+        is_header = pc.or_(is_header, pc.starts_with(pc.fill_null(_text_of(cells[0]), ""), "#"))
         known = pc.and_(pc.invert(pc.fill_null(is_header, True)), pc.is_valid(cells[time]))
         cells = {place: column.filter(known) for place, column in cells.items()}
-        words = {place: cells[place].cast(pa.string()) for place in [*named, *units]}
+        words = {place: _text_of(cells[place]) for place in [*named, *units]}
         varying = [place for place in named if len(pc.unique(words[place])) > 1]
         varying = varying or named[:1]
         source, label = str(text.head.path), text.headings[time]
@@ -297,6 +298,10 @@ def _time_of(text: TextTable) -> str:
     meanings = [(meaning_of(heading), heading) for heading in text.headings]
     times = [(m.rank, heading) for m, heading in meanings if m and m.quantity == "time"]
     return min(times, key=lambda item: item[0], default=(0, ""))[1]
+
+
+def _text_of(cells: Any) -> Any:
+    return cells.cast(pa.string())
 
 
 def _as_numbers(cells: Any) -> Any:

@@ -1,81 +1,28 @@
-"""Units of a log: conversion of stated units, errors where the values contradict a unit."""
+"""Values that contradict their unit: refused, with the unit to state."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterator, Sequence
-from typing import Final, cast
+from typing import Final
 
 import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
+from cangauge.logs.quantities import QUANTITIES
 from cangauge.logs.resolution import wrapped_current
-from cangauge.settings import TEMPERATURE_SOURCES, TemperatureSource
 
-FIELDS: Final[dict[str, str]] = {
-    "time": "time_s",
-    "current": "current_a",
-    "voltage": "voltage_v",
-    "temperature": "temperature_c",
-    "soc": "soc_pct",
-}
-"""Canonical column by the name that users write."""
-CANONICAL_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
-REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
-"""Columns of every log."""
-
-_SPELLINGS: Final[dict[str, dict[tuple[float, float], str]]] = {
-    "time_s": {
-        (1.0, 0.0): "s|sec|secs|second|seconds|sek|sekunden",
-        (1e-3, 0.0): "ms|msec|millis|millisecond|milliseconds",
-        (1e-6, 0.0): "us|µs|μs|usec|microsecond|microseconds",
-        (1e-9, 0.0): "ns|nanoseconds",
-        (60.0, 0.0): "min|mins|minuten|minutes",
-        (3600.0, 0.0): "h|hr|hrs|stunden|hours",
-        (86400.0, 0.0): "d|days",
-    },
-    "current_a": {
-        (1.0, 0.0): "a|amp|amps|amper|ampere|adc",
-        (1e-2, 0.0): "ca",
-        (1e-3, 0.0): "ma",
-        (1e-6, 0.0): "ua|µa|μa",
-        (1e3, 0.0): "ka",
-    },
-    "voltage_v": {
-        (1.0, 0.0): "v|volt|volts|vdc",
-        (1e-3, 0.0): "mv",
-        (1e-6, 0.0): "uv|µv|μv",
-        (1e3, 0.0): "kv",
-    },
-    "temperature_c": {
-        (1.0, 0.0): "c|°c|degc|deg c|deg. c|deg_c|celsius|grad c|grad celsius|℃|º c|ºc|â°c|\ufffdc",
-        (1.0, -273.15): "k|kelvin",
-        (5.0 / 9.0, -160.0 / 9.0): "f|°f|degf|deg f|fahrenheit|℉|ºf|â°f|\ufffdf",
-    },
-    "soc_pct": {
-        (1.0, 0.0): "%|per|pct|percent|prozent",
-        (100.0, 0.0): "1|-|0-1|0..1|fraction|ratio|pu",
-    },
-}
-"""Spellings (lower case, single blanks) by factor and offset to the canonical unit; of degrees also
-those that a wrong decoding leaves."""
-_UNITS: Final = {
-    field: {name: unit for unit, names in units.items() for name in names.split("|")}
-    for field, units in _SPELLINGS.items()
-}
+_TIME_UNITS: Final = QUANTITIES["time"].units
 _WORDS: Final = {
-    names.partition("|")[0]: names.rpartition("|")[2] for names in _SPELLINGS["time_s"].values()
-} | {"d": "days (dates of a spreadsheet)"}
-_SCALED: Final = re.compile(r"(?P<scale>0?[.,]\d+|1|10+(?=\s*[mµμu]))\s*(?P<unit>\D+)$")
-"""A unit of a bit: 0.1V, 10mV; 500A is the range of a sensor."""
-_FOREIGN: Final = (
-    "w|kw|wh|kwh|ah|mah|as|nm|rpm|km/h|kmh|mph|hz|khz|pa|bar|mbar|ohm|mohm|ω|mω|v/s|a/s|k/s|wh/kg"
-    "|ah/kg|mah/g|m|m/s|kg|l|deg"
-)
-FOREIGN_UNITS: Final = frozenset(_FOREIGN.split("|"))
-"""Units of quantities that no log holds; a heading with one of them is none of its columns."""
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+    "min": "minutes",
+    "h": "hours",
+    "d": "days (dates of a spreadsheet)",
+}
 
 # Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
 _MAX_VOLTAGE_V: Final = 1500.0
@@ -102,49 +49,6 @@ WRAPPED: Final = "a signed value was read as unsigned"
 
 _Wrong = tuple[float, str, str, list[str]]
 """A value that contradicts its unit, the problem, the cure, and units that the user may state."""
-
-
-def known_temperature_source(word: str, *, source: str | None = None) -> TemperatureSource:
-    """Return the word if it names a temperature source, else raise InputError."""
-    if word not in TEMPERATURE_SOURCES:
-        problem, field = "not a known temperature source", "temperature_source"
-        cure = f"use one of: {', '.join(TEMPERATURE_SOURCES)}"
-        raise InputError(problem, source=source, field=field, value=word, cure=cure)
-    return cast("TemperatureSource", word)
-
-
-def unit_of(field: str, unit: str) -> tuple[float, float] | None:
-    """Return (factor, offset) from a unit to the canonical one of a field; None if unknown.
-
-    Examples
-    --------
-    >>> unit_of("current_a", "mA")
-    (0.001, 0.0)
-    >>> unit_of("voltage_v", "0.1V")
-    (0.1, 0.0)
-    """
-    name = " ".join(unit.lower().removeprefix("unit_").split())
-    scale = _SCALED.match(name)
-    if name in _UNITS[field] or scale is None or scale["unit"] not in _UNITS[field]:
-        return _UNITS[field].get(name)
-    factor, offset = _UNITS[field][scale["unit"]]
-    return factor * float(scale["scale"].replace(",", ".")), offset
-
-
-def convert(values: FloatArray, field: str, unit: str, *, source: object, label: str) -> FloatArray:
-    """Return values of shape (n,) in the canonical unit, from a stated one ("": the canonical).
-
-    Raises
-    ------
-    InputError
-        If the unit is not known for this quantity.
-    """
-    scale = unit_of(field, unit) if unit.strip() else (1.0, 0.0)
-    if scale is None:
-        problem = f"the unit is not known for {field}"
-        cure = f"convert it to one of: {', '.join(_UNITS[field])}"
-        raise InputError(problem, source=str(source), field=label, value=unit, cure=cure)
-    return values if scale == (1.0, 0.0) else values * scale[0] + scale[1]
 
 
 def refuse_wrong_units(
@@ -256,13 +160,13 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
 
 def _fitting(interval: float, units: Sequence[str]) -> list[str]:
     """Return those of the units in which rows are as far apart as a log's."""
-    step_s = {unit: interval * _UNITS["time_s"][unit][0] for unit in units}
+    step_s = {unit: interval * _TIME_UNITS[unit][0] for unit in units}
     return [unit for unit in units if _FASTEST_S <= step_s[unit] <= _MAX_INTERVAL_S]
 
 
 def _other_units(values: dict[str, FloatArray], finer: list[str], coarser: list[str]) -> list[str]:
     """Return those of the units that time may be in as well as in seconds."""
-    time, scale = values["time_s"], _UNITS["time_s"]
+    time, scale = values["time_s"], _TIME_UNITS
     step = np.diff(time) if time.size > 1 else np.ones(1)
     # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
     if finer and np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0:
