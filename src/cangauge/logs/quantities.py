@@ -20,7 +20,7 @@ _SCALED: Final = re.compile(r"(?P<scale>0?[.,]\d+|1|10+(?=\s*[mµμu]))\s*(?P<un
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class LogQuantity:
     """A quantity of a log.
 
     Parameters
@@ -59,8 +59,8 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-def _quantity(table: dict[str, Any]) -> Quantity:
-    return Quantity(
+def _quantity(table: dict[str, Any]) -> LogQuantity:
+    return LogQuantity(
         table["field"],
         table["unit"],
         _words(table["words"]),
@@ -76,7 +76,7 @@ def _quantity(table: dict[str, Any]) -> Quantity:
 
 
 _TABLE: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-QUANTITIES: Final[dict[str, Quantity]] = {
+QUANTITIES: Final[dict[str, LogQuantity]] = {
     name: _quantity(table) for name, table in _TABLE["quantity"].items()
 }
 """Quantities by the name that users write."""
