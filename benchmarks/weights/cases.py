@@ -23,7 +23,6 @@ from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.plant import TwinPlant
 from cangauge.extras.validation.twin.recording import record_drive, rms
 from cangauge.logs.log import Log
 
@@ -273,21 +272,21 @@ def made_pack(seed: int, folder: Path) -> tuple[packs.PackLogs, TwinPack]:
     file = folder / f"pack_{seed}.pickle"
     if not file.exists():
         rng = np.random.default_rng([seed, 1])
-        plant = TwinPlant(draw_pack(rng))
+        drawn = draw_pack(rng)
         middle_c = float(rng.uniform(8.0, 25.0))
         ambient = rng.permutation(np.linspace(middle_c - 9.0, middle_c + 9.0, DRIVES))
         drives = [
-            draw_drive(rng, plant.pack, hours=float(rng.uniform(0.5, 1.2)), ambient_c=float(c))
+            draw_drive(rng, drawn, hours=float(rng.uniform(0.5, 1.2)), ambient_c=float(c))
             for c in ambient
         ]
         logs = [
-            packs.thinned(record_drive(plant, x, (), name=f"drive_{k}").log, 0.5)
+            packs.thinned(record_drive(drawn, x, name=f"drive_{k}").log, 0.5)
             for k, x in enumerate(drives)
         ]
         exact = replace(
-            plant.pack.sensors, current_step_a=0.0, voltage_step_v=0.0, temperature_step_k=0.0
+            drawn.sensors, current_step_a=0.0, voltage_step_v=0.0, temperature_step_k=0.0
         )
-        own = replace(plant.pack, sensors=exact)
-        file.write_bytes(pickle.dumps((logs, plant.pack.capacity_ah, plant.pack.cells, own)))
+        own = replace(drawn, sensors=exact)
+        file.write_bytes(pickle.dumps((logs, drawn.capacity_ah, drawn.cells, own)))
     logs, capacity_ah, cells, own = pickle.loads(file.read_bytes())
     return packs.PackLogs("simulated", "simulated", logs, capacity_ah, cells, (3, 20)), own

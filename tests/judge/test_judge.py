@@ -33,7 +33,7 @@ def pack() -> Pack:
     """Model and healthy days of a simulated pack."""
     runs = [cangauge.simulate(seed=3, drive=k, hours=0.5, ambient_c=20.0) for k in range(1, 10)]
     logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
-    capacity_ah = runs[0].plant.pack.capacity_ah
+    capacity_ah = runs[0].pack.capacity_ah
     model = cangauge.fit(logs[:4], capacity_ah=capacity_ah, chemistry="oxide").model
     return model, logs[4:]
 

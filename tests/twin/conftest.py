@@ -7,7 +7,6 @@ import pytest
 
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.plant import TwinPlant
 
 
 @pytest.fixture(scope="session")
@@ -18,11 +17,6 @@ def pack() -> TwinPack:
         if found.sensors.rate_hz == 1.0:
             return found
     pytest.fail("no pack with a rate of 1 Hz")
-
-
-@pytest.fixture(scope="session")
-def plant(pack: TwinPack) -> TwinPlant:
-    return TwinPlant(pack)
 
 
 @pytest.fixture(scope="session")

@@ -91,7 +91,7 @@ def test_full_discharge_gives_its_capacity() -> None:
     """An end at 2.03 % SoC would not count as empty."""
     full = simulate(seed=1, discharge=True, hours=1.0)
     found = capacity_from_full_discharge([full.log], [None])
-    assert found == pytest.approx(full.plant.pack.capacity_ah, rel=0.01)
+    assert found == pytest.approx(full.pack.capacity_ah, rel=0.01)
 
 
 @pytest.mark.parametrize(

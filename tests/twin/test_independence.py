@@ -12,7 +12,7 @@ UNDER_TEST = ("cangauge.model", "cangauge.diagnosis", "cangauge.identify", "cang
 
 def modules(project: Path, folder: str) -> list[Path]:
     found = sorted((project / "src/cangauge" / folder).rglob("*.py"))
-    assert len(found) > 8
+    assert len(found) >= 8
     return found
 
 

@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lsim
 
-from cangauge.extras.validation.twin.condition import HEALTHY
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
 from cangauge.extras.validation.twin.pack import KINDS, TwinPack, draw_pack
-from cangauge.extras.validation.twin.plant import TwinPlant, lagged, relax, temperatures
-from cangauge.extras.validation.twin.recording import simulate_truth, true_soc_pct
+from cangauge.extras.validation.twin.plant import lagged, relax, simulate_truth, temperatures
+from cangauge.extras.validation.twin.recording import true_soc_pct
 
 
 def constant_drive(
@@ -25,30 +24,30 @@ def constant_drive(
     return Drive(time_s, current_a, np.full_like(time_s, celsius), celsius, start_soc, seed=1)
 
 
-def test_charge_is_the_integral_of_the_current(plant: TwinPlant, drive: Drive) -> None:
-    truth = simulate_truth(plant, drive)
-    moved_ah = np.trapezoid(truth.current_a, truth.time_s) / 3600.0
-    soc = true_soc_pct(plant.pack, drive, truth, HEALTHY)
-    assert soc[0] - soc[-1] == pytest.approx(100.0 * moved_ah / plant.pack.capacity_ah, rel=1e-9)
+def test_charge_is_the_integral_of_the_current(pack: TwinPack, drive: Drive) -> None:
+    truth = simulate_truth(pack, drive)
+    moved_ah = np.trapezoid(truth.current_a, drive.time_s) / 3600.0
+    soc = true_soc_pct(pack, drive, truth.current_a)
+    assert soc[0] - soc[-1] == pytest.approx(100.0 * moved_ah / pack.capacity_ah, rel=1e-9)
     # The mean of the cells agrees, except for their capacity spread.
     assert truth.soc[-1] == pytest.approx(soc[-1] / 100.0, abs=2e-3)
 
 
-def test_chemical_energy_is_work_plus_heat(plant: TwinPlant, drive: Drive) -> None:
-    truth = simulate_truth(plant, drive)
+def test_chemical_energy_is_work_plus_heat(pack: TwinPack, drive: Drive) -> None:
+    truth = simulate_truth(pack, drive)
     step = drive.step_s
     chemical = np.sum(truth.equilibrium_v * truth.current_a) * step
     work = np.sum(truth.voltage_v * truth.current_a) * step
     kelvin = truth.core_c + 273.15
-    soc = plant.pack.chemistry.entropy(truth.soc)
-    reversible = -np.sum(truth.current_a * kelvin * plant.pack.cells * soc) * step
+    soc = pack.chemistry.entropy(truth.soc)
+    reversible = -np.sum(truth.current_a * kelvin * pack.cells * soc) * step
     heat = np.sum(truth.heat_w) * step
     assert chemical - work == pytest.approx(heat - reversible, rel=0.01)
     assert 0.005 * work < chemical - work < 0.2 * work
 
 
 def test_heat_is_stored_or_lost_to_ambient(pack: TwinPack, drive: Drive) -> None:
-    truth = simulate_truth(TwinPlant(pack), drive)
+    truth = simulate_truth(pack, drive)
     core, surface = temperatures(pack, drive, truth.heat_w)
     assert np.max(np.abs(core - truth.core_c)) < 0.05  # temperatures and heat are consistent
     stored = pack.core_j_k * (core[-1] - core[0]) + pack.surface_j_k * (surface[-1] - surface[0])
@@ -58,39 +57,39 @@ def test_heat_is_stored_or_lost_to_ambient(pack: TwinPack, drive: Drive) -> None
     assert stored + lost == pytest.approx(made, rel=0.01)
 
 
-def test_voltage_drops_in_a_pulse_and_relaxes(plant: TwinPlant) -> None:
+def test_voltage_drops_in_a_pulse_and_relaxes(pack: TwinPack) -> None:
     current = np.zeros(7200)
-    current[200:1400] = plant.pack.one_c_a
-    truth = simulate_truth(plant, constant_drive(current))
+    current[200:1400] = pack.capacity_ah
+    truth = simulate_truth(pack, constant_drive(current))
     volts = truth.voltage_v
     rest, at_once, later = volts[199], volts[202], volts[1399]
-    assert rest - at_once == pytest.approx(plant.pack.resistance_ohm * plant.pack.one_c_a, rel=0.35)
+    assert rest - at_once == pytest.approx(pack.resistance_ohm * pack.capacity_ah, rel=0.35)
     assert later < at_once - 0.2  # diffusion and discharge continue
     after = volts[[1402, 1600, 2400, 7199]]
     assert np.all(np.diff(after) > -1e-3)
     assert volts[-1] == pytest.approx(truth.equilibrium_v[-1], abs=0.05)
 
 
-def test_resistance_rises_in_the_cold(plant: TwinPlant) -> None:
+def test_resistance_rises_in_the_cold(pack: TwinPack) -> None:
     current = np.zeros(200)
-    current[100:] = 0.5 * plant.pack.one_c_a
+    current[100:] = 0.5 * pack.capacity_ah
 
     def drop(celsius: float) -> float:
-        volts = simulate_truth(plant, constant_drive(current, celsius=celsius)).voltage_v
+        volts = simulate_truth(pack, constant_drive(current, celsius=celsius)).voltage_v
         return float(volts[99] - volts[119])
 
     assert 1.8 < drop(-10.0) / drop(25.0) < 6.0
     assert drop(35.0) < drop(25.0)
 
 
-def test_kinetic_overpotential_grows_less_than_linearly(plant: TwinPlant) -> None:
+def test_kinetic_overpotential_grows_less_than_linearly(pack: TwinPack) -> None:
     def drop(amperes: float) -> float:
         current = np.zeros(60)
         current[20:] = amperes
-        volts = simulate_truth(plant, constant_drive(current, celsius=0.0)).voltage_v
+        volts = simulate_truth(pack, constant_drive(current, celsius=0.0)).voltage_v
         return float(volts[19] - volts[24])
 
-    one_c = plant.pack.one_c_a
+    one_c = pack.capacity_ah
     assert drop(3.0 * one_c) < 0.99 * 3.0 * drop(one_c)
     assert drop(one_c) > 0.0 > drop(-one_c)
 
@@ -100,11 +99,11 @@ def test_every_kind_of_pack_stays_in_its_voltage_range(kind: str) -> None:
     rng = np.random.default_rng(11)
     pack = draw_pack(rng, kind)
     drive = draw_drive(rng, pack, hours=0.6)
-    truth = simulate_truth(TwinPlant(pack), drive)
+    truth = simulate_truth(pack, drive)
     rows = slice(0, truth.rows)
     cell_v = truth.voltage_v[rows] / pack.cells
     assert np.all((cell_v > 2.0) & (cell_v < 4.4))
-    assert np.all(np.abs(truth.current_a) < 4.5 * pack.one_c_a)
+    assert np.all(np.abs(truth.current_a) < 4.5 * pack.capacity_ah)
     assert np.all((truth.core_c > -15.0) & (truth.core_c < 60.0))
 
 
@@ -112,17 +111,17 @@ def test_seed_determines_the_simulation() -> None:
     def run(seed: int) -> np.ndarray:
         rng = np.random.default_rng(seed)
         pack = draw_pack(rng, "compact")
-        return simulate_truth(TwinPlant(pack), draw_drive(rng, pack, hours=0.3)).voltage_v
+        return simulate_truth(pack, draw_drive(rng, pack, hours=0.3)).voltage_v
 
     assert np.array_equal(run(5), run(5))
     assert not np.array_equal(run(5), run(6))
 
 
-def test_long_drive_takes_under_two_seconds(plant: TwinPlant) -> None:
+def test_long_drive_takes_under_two_seconds(pack: TwinPack) -> None:
     rng = np.random.default_rng(2)
-    drive = draw_drive(rng, plant.pack, hours=2.5, start_soc=1.0, end_soc=0.02, discharge=True)
+    drive = draw_drive(rng, pack, hours=2.5, start_soc=1.0, end_soc=0.02, discharge=True)
     began = time.process_time()
-    simulate_truth(plant, drive)
+    simulate_truth(pack, drive)
     assert time.process_time() - began < 2.0  # usually about 0.1 s
 
 

@@ -10,7 +10,6 @@ import pytest
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
 from cangauge.extras.validation.twin.faults import Fault
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.plant import TwinPlant
 from cangauge.extras.validation.twin.recording import record_drive, rms
 
 
@@ -19,16 +18,14 @@ def with_sensors(pack: TwinPack, **changes: float) -> TwinPack:
 
 
 def test_values_are_quantized(pack: TwinPack, drive: Drive) -> None:
-    plant = TwinPlant(
-        with_sensors(pack, current_step_a=0.5, voltage_step_v=0.25, temperature_step_k=1.0)
-    )
-    log = record_drive(plant, drive, ()).log
+    coarse = with_sensors(pack, current_step_a=0.5, voltage_step_v=0.25, temperature_step_k=1.0)
+    log = record_drive(coarse, drive).log
     for values, step in ((log.current_a, 0.5), (log.voltage_v, 0.25), (log.temperature_c, 1.0)):
         np.testing.assert_allclose(values / step, np.rint(values / step), atol=1e-6)
 
 
-def test_log_has_the_assumed_initial_soc_only(plant: TwinPlant, drive: Drive) -> None:
-    log = record_drive(plant, drive, ()).log
+def test_log_has_the_assumed_initial_soc_only(pack: TwinPack, drive: Drive) -> None:
+    log = record_drive(pack, drive).log
     assert log.soc_pct is not None
     assert log.soc_pct[0] == pytest.approx(90.0, abs=0.6)
     assert np.all(np.isnan(log.soc_pct[1:]))
@@ -39,7 +36,7 @@ def test_samples_have_jitter_and_losses(rate_hz: float) -> None:
     rng = np.random.default_rng(4)
     pack = with_sensors(draw_pack(rng, "leaf40"), rate_hz=rate_hz, jitter=0.05, drop_share=0.01)
     drive = draw_drive(rng, pack, hours=0.4)
-    log = record_drive(TwinPlant(pack), drive, ()).log
+    log = record_drive(pack, drive).log
     intervals = np.diff(log.time_s)
     assert np.median(intervals) == pytest.approx(1.0 / rate_hz, rel=0.02)
     assert 0.02 < np.std(intervals[intervals < 1.5 / rate_hz]) * rate_hz < 0.1
@@ -47,18 +44,18 @@ def test_samples_have_jitter_and_losses(rate_hz: float) -> None:
     assert 0.97 * expected < len(log) < 0.9985 * expected
 
 
-def test_sensor_error_is_that_of_a_perfect_model(plant: TwinPlant, drive: Drive) -> None:
-    recording = record_drive(plant, drive, ())
+def test_sensor_error_is_that_of_a_perfect_model(pack: TwinPack, drive: Drive) -> None:
+    recording = record_drive(pack, drive)
     assert np.all(recording.gap_v == 0.0)
-    sensors = plant.pack.sensors
+    sensors = pack.sensors
     least = np.hypot(sensors.voltage_noise_v, sensors.voltage_step_v / np.sqrt(12.0))
     assert 0.95 * least < rms(recording.sensor_error_v) < 4.0 * least + 0.3
     error = recording.log.voltage_v - recording.expected_voltage_v
     assert rms(error) < 1.3 * rms(recording.sensor_error_v) + 0.05
 
 
-def test_log_ends_when_the_lowest_cell_is_empty(plant: TwinPlant, drive: Drive) -> None:
-    whole = record_drive(plant, drive, ()).log
-    short = record_drive(plant, drive, (Fault("capacity", 0.4),)).log
+def test_log_ends_when_the_lowest_cell_is_empty(pack: TwinPack, drive: Drive) -> None:
+    whole = record_drive(pack, drive).log
+    short = record_drive(pack, drive, (Fault("capacity", 0.4),)).log
     assert short.duration_s < 0.9 * whole.duration_s
-    assert short.voltage_v.min() / plant.pack.cells > 2.0
+    assert short.voltage_v.min() / pack.cells > 2.0

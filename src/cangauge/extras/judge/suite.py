@@ -148,7 +148,7 @@ def simulated_drives() -> list[PlayedDrive]:
         runs = [simulate(seed=seed, discharge=True)]
         runs += [simulate(seed=seed, drive=2 + k, hours=HOURS) for k in range(2 * DRIVES_A_PACK)]
         logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
-        model = fit(logs[:-DRIVES_A_PACK], capacity_ah=runs[0].plant.pack.capacity_ah).model
+        model = fit(logs[:-DRIVES_A_PACK], capacity_ah=runs[0].pack.capacity_ah).model
         found += _played(logs[-DRIVES_A_PACK:], model)
     return found
 

@@ -1,7 +1,6 @@
 """Validation: simulated truth, and what the diagnosis finds of it.
 
     twin        packs, drives and faults whose cause is known; shares nothing with what it validates
-    cases       a simulated pack with training logs and references
     gap_check   every effect injected into healthy logs of a pack, each left out in turn
 
 The public names are those of the twin, loaded on first use.

@@ -21,9 +21,8 @@ from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject, scale_injection
-from cangauge.extras.validation.twin.pack import TwinPack
+from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
 from cangauge.extras.validation.twin.recording import record_drive
-from cangauge.extras.validation.twin.simulation import draw_plant
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 
@@ -95,8 +94,8 @@ class CheckedPack:
     @classmethod
     def simulated(cls) -> CheckedPack:
         """Return a simulated pack with a discharge and five drives."""
-        plant, rng = draw_plant(np.random.default_rng([1, 1])), np.random.default_rng([1, 2])
-        pack, ambient_c = plant.pack, float(rng.uniform(8.0, 25.0))
+        pack, rng = draw_pack(np.random.default_rng([1, 1])), np.random.default_rng([1, 2])
+        ambient_c = rng.uniform(8.0, 25.0)
         drives = [
             draw_drive(
                 rng,
@@ -109,12 +108,11 @@ class CheckedPack:
             )
         ]
         drives += [
-            draw_drive(rng, pack, hours=0.8, ambient_c=float(ambient_c + away))
+            draw_drive(rng, pack, hours=0.8, ambient_c=ambient_c + away)
             for away in np.linspace(-7.0, 7.0, SIMULATED_LOGS - 1)
         ]
         logs = [
-            record_drive(plant, drive, (), name=f"drive_{k}").log
-            for k, drive in enumerate(drives, 1)
+            record_drive(pack, drive, name=f"drive_{k}").log for k, drive in enumerate(drives, 1)
         ]
         return cls(tuple(logs), pack.capacity_ah, pack)
 
@@ -158,11 +156,10 @@ class CheckedPack:
             shape = {"at_s": 0.4 * log.duration_s} if "at_s" in kind.shape else {}
             wanted = Fault(kind.id, -1.0 if kind.id == "initial_soc" else 1.0, shape, seed=0)
             for floors in FLOORS:
-                scaled = scale_injection([log], wanted, floors * floor_v, self.pack)
-                if scaled.reached_v < _REACHED * floors * floor_v:
+                fault, reached_v = scale_injection(log, wanted, floors * floor_v, self.pack)
+                if reached_v < _REACHED * floors * floor_v:
                     break  # no larger size is possible
-                injected = inject(log, [scaled.fault], self.pack).log
-                yield injected, scaled.fault, scaled.reached_v / floor_v
+                yield inject(log, [fault], self.pack).log, fault, reached_v / floor_v
 
 
 PER_LOG: Final = 1 + len(fault_kinds()) * len(FLOORS)

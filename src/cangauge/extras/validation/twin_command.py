@@ -95,11 +95,8 @@ def twin_command(
             pack=pack,
             name=output.stem,
         )
-    for scaled in simulated.limited:
-        note(
-            f"{scaled.fault.id}: on this drive its physical limits allow a gap of"
-            f" {scaled.reached_v:.3g} V, not {scaled.target_v:.3g} V"
-        )
+    for text in simulated.notes:
+        note(text)
     write_log(simulated.log, output)
     result = {**simulated.to_dict(), "seconds": time.perf_counter() - began}
     finish(result, partial(_show, result), {"log": output}, as_json=json_output)

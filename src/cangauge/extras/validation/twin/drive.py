@@ -248,8 +248,8 @@ def _current(
     current = (open_v - np.sqrt(inner)) / (2.0 * resistance)
     # Charge acceptance: none when full, at most about 1.5C.
     room = np.clip((0.985 - (start - used)) / 0.05, 0.02, 1.0)
-    limit = pack.one_c_a * rng.uniform(0.8, 1.6) * room
-    current = np.clip(current, -limit, pack.one_c_a * rng.uniform(2.5, 4.0))
+    limit = pack.capacity_ah * rng.uniform(0.8, 1.6) * room
+    current = np.clip(current, -limit, pack.capacity_ah * rng.uniform(2.5, 4.0))
     rate = max(2.0, pack.sensors.rate_hz)
     coarse = np.arange(power_w.size, dtype=np.float64)
     fine = np.arange(0.0, coarse[-1], 1.0 / rate)
@@ -273,9 +273,9 @@ def _with_charging(
     most_s = 0.33 * current.size * step_s
     rate = max(float(rng.uniform(0.25, 1.0)), 3600.0 * 0.03 / most_s)
     seconds = min(3600.0 * gained / rate, most_s)
-    plugged = -rate * pack.one_c_a * np.ones(int(seconds / step_s))
+    plugged = -rate * pack.capacity_ah * np.ones(int(seconds / step_s))
     ramp = np.minimum(1.0, np.arange(plugged.size) * step_s / 20.0)
-    idle = np.full(int(rng.uniform(20.0, 120.0) / step_s), 0.002 * pack.one_c_a)
+    idle = np.full(int(rng.uniform(20.0, 120.0) / step_s), 0.002 * pack.capacity_ah)
     parts = (current[:row], idle, plugged * ramp * ramp[::-1], idle, current[row:])
     return np.concatenate(parts)[: current.size]
 

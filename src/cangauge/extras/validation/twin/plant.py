@@ -1,29 +1,46 @@
-"""Plant: model of a pack that returns voltage, state of charge and heat for a current.
+"""The pack as a plant: voltage, state of charge, heat and temperatures for a current.
 
-`TwinPlant` simulates the cells by tabulated open-circuit voltage, asymmetric Butler–Volmer
-kinetics, diffusion and cell spread.
+The cells have a tabulated open-circuit voltage, asymmetric Butler–Volmer kinetics, diffusion and
+spread. Faults act by their ids (`faults.toml`): those of the pack here, those of its sensors in
+`recording`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.signal import lfilter
 
 from cangauge._typing import FloatArray
-from cangauge.extras.validation.twin.condition import Condition
 from cangauge.extras.validation.twin.drive import Drive
+from cangauge.extras.validation.twin.faults import HEALTHY, Fault, Faults
 from cangauge.extras.validation.twin.pack import KELVIN, TwinPack
 
 REFERENCE_K: Final = 298.15
 _GLASS_K: Final = 230.0
-_HYSTERESIS_REACHES: Final = (0.06, 0.15, 0.35, 0.65, 1.0)  # of the stop operators, relative
-_BEND_A: Final = 3.0
+"""Temperature at which the fault `resistance_temperature` diverges [K]."""
 _VOGEL_ZERO_K: Final = 170.0
 _GAS_OVER_FARADAY_V_K: Final = 8.617333e-5
+_BEND_A: Final = 3.0
+"""Current within which a rectifying contact turns over [A]."""
+_HYSTERESIS_REACHES: Final = np.array([0.06, 0.15, 0.35, 0.65, 1.0])
+"""Reaches of the stop operators, relative to the fault's."""
+_COLE_SPREAD: Final = np.array([-1.6, -1.0, -0.5, 0.0, 0.5, 1.0, 1.6])
+"""Relaxations of a Cole–Cole element, in e-folds of its time constant."""
+_WARBURG_POLES: Final = np.arange(1.0, 12.0, 2.0) ** 2
+"""First six poles of a finite Warburg element, relative to the slowest."""
+_ADDED_ACTIVATION_K: Final = 1500.0
+"""Activation energy of added relaxations over the gas constant [K]."""
+_EMPTY_V: Final = {"lfp": 1.8}
+"""Voltage of the lowest cell at which the car stops [V], by chemistry."""
+_OTHERS_EMPTY_V: Final = 2.2
 _THERMAL_STEP_S: Final = 5.0
+TOLERANCE_K: Final = 0.05
+"""Change of the core temperature at which the thermal iteration stops."""
+_MAX_ITERATIONS: Final = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,101 +57,129 @@ class Response:
         Open-circuit voltage at the mean SoC of each cell, summed over the cells [V].
     heat_w : array
         Irreversible and reversible heat [W].
-    lowest_v : array
-        Voltage of the lowest cell [V].
+    rows : int
+        Rows until the lowest cell is empty and the car stops.
     """
 
     voltage_v: FloatArray
     soc: FloatArray
     equilibrium_v: FloatArray
     heat_w: FloatArray
-    lowest_v: FloatArray
+    rows: int
 
 
-class Plant(Protocol):
-    """Model of a pack."""
+@dataclass(frozen=True, eq=False)
+class Truth(Response):
+    """Response to a drive, with the current through the cells [A] and the temperatures [°C]."""
 
-    @property
-    def name(self) -> str:
-        """Name of the model."""
-
-    @property
-    def pack(self) -> TwinPack:
-        """Size, thermal masses, sensors and open-circuit voltage."""
-
-    @property
-    def temperature_tolerance_k(self) -> float:
-        """Change of the core temperature at which the thermal iteration stops [K]."""
-
-    def respond(
-        self, drive: Drive, condition: Condition, current_a: FloatArray, core_c: FloatArray
-    ) -> Response:
-        """Return the response to a current.
-
-        Parameters
-        ----------
-        drive : Drive
-            Time grid, initial SoC and history.
-        condition : Condition
-        current_a : array of shape (n,)
-            Current through the cells [A], positive = discharge.
-        core_c : array of shape (n,)
-            Temperature of the cells [°C].
-        """
+    current_a: FloatArray
+    core_c: FloatArray
+    surface_c: FloatArray
 
 
-class TwinPlant:
-    """Cells with kinetics, diffusion and spread."""
+def simulate_truth(
+    pack: TwinPack, drive: Drive, faults: Faults = HEALTHY, near: Truth | None = None
+) -> Truth:
+    """Simulate a drive of a pack with faults.
 
-    name = "twin"
-    temperature_tolerance_k = 0.05
+    Temperature and voltage are coupled by the heat: a fixed-point iteration runs until the core
+    temperature changes by less than the tolerance.
 
-    def __init__(self, pack: TwinPack) -> None:
-        self.pack = pack
+    Parameters
+    ----------
+    pack : TwinPack
+    drive : Drive
+    faults : Faults
+    near : Truth, optional
+        The same drive with other faults, as the start of the iteration. Within the tolerance its
+        temperatures are kept, so that the voltages differ by the faults alone.
+    """
+    current_a, insulation = through_cells(drive, faults), faults.size("core_temperature")
+    if near is None:
+        kelvin = np.full_like(current_a, drive.start_c + KELVIN)
+        heat_w = pack.resistance_ohm * 1.3 * ohmic_factor(pack, kelvin) * current_a**2
+        core_c, surface_c = temperatures(pack, drive, heat_w, insulation)
+    else:
+        core_c, surface_c = near.core_c, near.surface_c
+    response = respond(pack, drive, faults, current_a, core_c)
+    for _ in range(_MAX_ITERATIONS):
+        following = temperatures(pack, drive, response.heat_w, insulation)
+        if np.max(np.abs(following[0] - core_c)) < TOLERANCE_K:
+            break
+        core_c, surface_c = following
+        response = respond(pack, drive, faults, current_a, core_c)
+    return Truth(**vars(response), current_a=current_a, core_c=core_c, surface_c=surface_c)
 
-    def respond(
-        self, drive: Drive, condition: Condition, current_a: FloatArray, core_c: FloatArray
-    ) -> Response:
-        """Return the response to a current (see `Plant.respond`)."""
-        pack, kelvin = self.pack, core_c + KELVIN
-        weights, capacity, resistance, shift = _groups(pack, condition)
-        charge = discharged(drive, current_a, condition.charge_loss) / pack.capacity_ah
-        start = drive.start_soc + condition.start_soc_shift
-        soc = (start + shift)[:, None] - charge / capacity[:, None]
 
-        slow, quick, swing = _relaxed(pack, drive, current_a, kelvin)
-        surface = soc - swing / capacity[:, None]
-        chemistry = pack.chemistry
-        entropy = chemistry.entropy(soc)
-        if condition.entropy_shift_v_k is not None:
-            entropy = entropy + np.interp(soc, chemistry.grid, condition.entropy_shift_v_k)
-        warmth = entropy * (kelvin - REFERENCE_K)
-        equilibrium = chemistry.ocv(soc) + warmth
+def through_cells(drive: Drive, faults: Faults) -> FloatArray:
+    """Return the current of a drive with that of a hidden load [A], shape (n,)."""
+    if (load := faults.get("parasitic_switching")) is None:
+        return drive.current_a
+    return drive.current_a + load.size * load.is_active(drive.time_s)
 
-        loss = _kinetics(pack, condition, soc, quick, kelvin)
-        stiff = cold_resistance_factor(condition, kelvin)
-        ohmic = pack.ohmic_ohm * ohmic_factor(pack, kelvin) * stiff * current_a
-        loss += ohmic * (1.0 + soc_resistance_rise(condition, soc))
-        loss += slow
-        loss *= resistance[:, None]
-        loss += equilibrium - warmth - chemistry.ocv(surface)
 
-        drop = weights @ loss + pack.busbar_ohm * current_a
-        if condition.string_loss is not None:
-            drop = drop * (
-                1.0 + condition.string_loss.size * condition.string_loss.is_active(drive.time_s)
-            )
-        drop = drop + fault_drop(drive, condition, current_a, kelvin)
-        hysteresis = hysteresis_drop(drive, condition, charge) if condition.hysteresis_v else 0.0
-        open_v = weights @ equilibrium
-        reversible = -current_a * kelvin * (weights @ entropy)
-        return Response(
-            voltage_v=open_v - drop - hysteresis,
-            soc=weights @ soc / weights.sum(),
-            equilibrium_v=open_v,
-            heat_w=current_a * drop + reversible,
-            lowest_v=np.min(equilibrium - loss, axis=0),
-        )
+def respond(
+    pack: TwinPack, drive: Drive, faults: Faults, current_a: FloatArray, core_c: FloatArray
+) -> Response:
+    """Return the response to a current.
+
+    Parameters
+    ----------
+    pack : TwinPack
+    drive : Drive
+        Time grid, initial SoC and history.
+    faults : Faults
+    current_a : array of shape (n,)
+        Current through the cells [A], positive = discharge.
+    core_c : array of shape (n,)
+        Temperature of the cells [°C].
+    """
+    kelvin, cells = core_c + KELVIN, pack.chemistry
+    weights, capacity, resistance, shift = _groups(pack, faults)
+    charge = discharged(drive, faults, current_a) / pack.capacity_ah
+    soc = (start_soc(drive, faults) + shift)[:, None] - charge / capacity[:, None]
+
+    slow, quick, swing = _relaxed(pack, drive, current_a, kelvin)
+    entropy = cells.entropy(soc) + _entropy_change(pack, faults, soc)
+    warmth = entropy * (kelvin - REFERENCE_K)
+    equilibrium = cells.ocv(soc) + warmth
+
+    stiffening = 1.0 / (kelvin - _GLASS_K) - 1.0 / (REFERENCE_K - _GLASS_K)
+    stiff = np.exp(faults.size("resistance_temperature") * stiffening)
+    loss = _kinetics(pack, soc, quick, kelvin, stiff * (1.0 + faults.size("charge_transfer")))
+    ohmic = pack.ohmic_ohm * ohmic_factor(pack, kelvin) * stiff * current_a
+    loss += ohmic * (1.0 + _soc_rise(faults, soc))
+    loss += slow
+    loss *= resistance[:, None]
+    loss += equilibrium - warmth - cells.ocv(soc - swing / capacity[:, None])
+
+    drop = weights @ loss + pack.busbar_ohm * current_a
+    if (dropout := faults.get("string_dropout")) is not None:
+        drop = drop * (1.0 + dropout.size * dropout.is_active(drive.time_s))
+    drop = drop + _added_drop(drive, faults, current_a, kelvin)
+    open_v = weights @ equilibrium
+    lowest_v = np.min(equilibrium - loss, axis=0)
+    empty = np.flatnonzero(lowest_v < _EMPTY_V.get(cells.name, _OTHERS_EMPTY_V))
+    return Response(
+        voltage_v=open_v - drop - _hysteresis(drive, faults, charge),
+        soc=weights @ soc / weights.sum(),
+        equilibrium_v=open_v,
+        heat_w=current_a * drop - current_a * kelvin * (weights @ entropy),
+        rows=int(empty[0]) if empty.size else current_a.size,
+    )
+
+
+def start_soc(drive: Drive, faults: Faults) -> float:
+    """Return the true initial SoC [-]."""
+    return drive.start_soc + faults.size("initial_soc") / 100.0
+
+
+def discharged(drive: Drive, faults: Faults, current_a: FloatArray) -> FloatArray:
+    """Return the charge taken from the cells since the start [Ah], shape (n,)."""
+    loss = faults.size("coulombic_efficiency")
+    counted = np.where(current_a < 0.0, (1.0 - loss) * current_a, current_a)
+    steps = 0.5 * (counted[1:] + counted[:-1]) * drive.step_s / 3600.0
+    return np.concatenate(([0.0], np.cumsum(steps)))
 
 
 def relax(signal: FloatArray, step_s: float, tau_s: FloatArray) -> FloatArray:
@@ -208,7 +253,7 @@ def temperatures(
     ambient = np.interp(coarse, time_s, drive.ambient_c).tolist()
     between = pack.core_surface_w_k / (1.0 + insulation)
     core = surface = drive.start_c
-    cores, surfaces = [core], [surface]
+    nodes = [(core, surface)]
     # Conditioning heats or cools until the surface reaches its target.
     sign = 1.0 if drive.target_c >= drive.start_c else -1.0
     for joule_w, outside in zip(heat[:-1], ambient[:-1], strict=True):
@@ -218,73 +263,9 @@ def temperatures(
         loss = pack.surface_ambient_w_k * (surface - outside)
         core += step * (joule_w - flow) / pack.core_j_k
         surface += step * (flow - loss + conditioning) / pack.surface_j_k
-        cores.append(core)
-        surfaces.append(surface)
+        nodes.append((core, surface))
+    cores, surfaces = np.array(nodes).T
     return np.interp(time_s, coarse, cores), np.interp(time_s, coarse, surfaces)
-
-
-def cold_resistance_factor(condition: Condition, kelvin: FloatArray) -> FloatArray:
-    """Return faulty over healthy resistance at a temperature [-]."""
-    exponent = 1.0 / (kelvin - _GLASS_K) - 1.0 / (REFERENCE_K - _GLASS_K)
-    return np.exp(condition.cold_resistance_k * exponent)
-
-
-def discharged(drive: Drive, current_a: FloatArray, loss: float = 0.0) -> FloatArray:
-    """Return the charge taken from the cells since the start [Ah], shape (n,).
-
-    `loss` is the fraction of the charge put in that is lost.
-    """
-    counted = np.where(current_a < 0.0, (1.0 - loss) * current_a, current_a)
-    steps = 0.5 * (counted[1:] + counted[:-1]) * drive.step_s / 3600.0
-    return np.concatenate(([0.0], np.cumsum(steps)))
-
-
-def soc_resistance_rise(condition: Condition, soc: FloatArray) -> FloatArray | float:
-    """Return the relative rise of the ohmic resistance over the SoC [-], shape of soc."""
-    rise = condition.soc_resistance
-    if rise is None:
-        return 0.0
-    return rise.height / (1.0 + np.exp((soc - rise.centre) / rise.width))
-
-
-def fault_drop(
-    drive: Drive, condition: Condition, current_a: FloatArray, kelvin: FloatArray
-) -> FloatArray:
-    """Return the voltage drop of faults around the cells [V], shape (n,)."""
-    drop = np.zeros_like(current_a)
-    if condition.charging_ohm:
-        # A rectifying contact, smooth over some amperes around 0.
-        charging = 0.5 * (1.0 - current_a / np.hypot(current_a, _BEND_A))
-        drop += condition.charging_ohm * current_a * charging
-    if condition.step_ohm:
-        drop += condition.step_ohm * current_a * (drive.time_s >= condition.step_at_s)
-    if condition.flicker is not None:
-        drop += condition.flicker.size * current_a * condition.flicker.is_active(drive.time_s)
-    if condition.relaxations:
-        taus = np.array([mode.tau_s for mode in condition.relaxations])
-        slower = np.exp(1500.0 * (1.0 / kelvin - 1.0 / REFERENCE_K))
-        states = relax(current_a, drive.step_s, slower[:, None] * taus[None, :])
-        drop += states @ np.array([mode.ohm for mode in condition.relaxations])
-    return drop
-
-
-def hysteresis_drop(drive: Drive, condition: Condition, charge: FloatArray) -> FloatArray:
-    """Return the voltage drop of hysteresis [V]: five stop operators on the charge.
-
-    Prandtl–Ishlinskii model: each operator follows the charge until it saturates at its reach.
-    """
-    reach = condition.hysteresis_reach * np.array(_HYSTERESIS_REACHES)
-    state = drive.history * reach
-    total = np.empty_like(charge)
-    total[0] = float(np.mean(state / reach))
-    low, high = -reach, reach
-    share = 1.0 / (reach * reach.size)
-    for row, moved in enumerate(np.diff(charge).tolist(), start=1):
-        state += moved
-        np.minimum(state, high, out=state)
-        np.maximum(state, low, out=state)
-        total[row] = share @ state
-    return condition.hysteresis_v * total
 
 
 def ohmic_factor(pack: TwinPack, kelvin: FloatArray) -> FloatArray:
@@ -293,27 +274,45 @@ def ohmic_factor(pack: TwinPack, kelvin: FloatArray) -> FloatArray:
     return np.exp(pack.ohmic_vogel_k * exponent)
 
 
-def _overpotential_table(anodic: float) -> tuple[FloatArray, FloatArray]:
-    """Tabulate i/i0 and Fη/RT of asymmetric Butler–Volmer kinetics, to be inverted."""
-    eta = np.sinh(np.linspace(-6.0, 6.0, 1201)) / np.sinh(6.0) * 30.0
-    return np.exp(anodic * eta) - np.exp(-(1.0 - anodic) * eta), eta
-
-
 def _groups(
-    pack: TwinPack, condition: Condition
+    pack: TwinPack, faults: Faults
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return number of cells, capacity factor, resistance factor, start shift, shape (g,) each."""
-    weights, capacity = pack.weights, pack.capacity_factor * condition.capacity_factor
+    left = 1.0 - faults.size("capacity")
+    weights, capacity = pack.weights, pack.capacity_factor * left
     resistance, shift = pack.resistance_factor, pack.soc_shift
-    weak = condition.weak
-    if weak is not None:
+    if (weak := faults.get("weak_cell")) is not None:
+        shape = weak.full_shape()
         weights = weights.copy()
-        weights[weights.size // 2] -= weak.count
-        weights = np.append(weights, weak.count)
-        capacity = np.append(capacity, condition.capacity_factor * (1.0 - weak.loss))
-        resistance = np.append(resistance, 1.0 + 0.5 * weak.loss)
-        shift = np.append(shift, -weak.deficit)
+        weights[weights.size // 2] -= shape["count"]
+        weights = np.append(weights, shape["count"])
+        capacity = np.append(capacity, left * (1.0 - weak.size))
+        resistance = np.append(resistance, 1.0 + 0.5 * weak.size)
+        shift = np.append(shift, -shape["deficit"] * weak.size)
     return weights, capacity, resistance, shift
+
+
+def _entropy_change(pack: TwinPack, faults: Faults, soc: FloatArray) -> FloatArray | float:
+    """Return the change of dU/dT of a cell [V/K]: a smooth curve over the SoC, from the seed."""
+    if (fault := faults.get("entropic_coefficient")) is None:
+        return 0.0
+    rng, grid = np.random.default_rng(fault.seed), pack.chemistry.grid
+    knots = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+    curve = PchipInterpolator(knots, rng.normal(size=5) + 0.8 * rng.choice((-1.0, 1.0)))
+    bend: FloatArray = curve(np.clip(grid, 0.0, 1.0))
+    bend *= 1e-3 * fault.size / np.sqrt(np.mean(bend**2))
+    return np.interp(soc, grid, bend)
+
+
+def _soc_rise(faults: Faults, soc: FloatArray) -> FloatArray | float:
+    """Return the relative rise of the ohmic resistance over the SoC [-], shape of soc."""
+    if (rise := faults.get("resistance_soc")) is None:
+        return 0.0
+    shape = rise.full_shape()
+    centre, width = shape["centre"], shape["width"]
+    if shape["towards_full"] > 0.75:
+        centre, width = 1.0 - centre, -width
+    return np.asarray(rise.size / (1.0 + np.exp((soc - centre) / width)))
 
 
 def _relaxed(
@@ -333,12 +332,77 @@ def _relaxed(
 
 
 def _kinetics(
-    pack: TwinPack, condition: Condition, soc: FloatArray, current_a: FloatArray, kelvin: FloatArray
+    pack: TwinPack,
+    soc: FloatArray,
+    current_a: FloatArray,
+    kelvin: FloatArray,
+    slowdown: FloatArray,
 ) -> FloatArray:
-    """Return the overpotential of the reaction, shape (g, n)."""
+    """Return the overpotential of the reaction [V], shape (g, n): Butler–Volmer, inverted."""
     activation = pack.exchange_activation_k * (1.0 / REFERENCE_K - 1.0 / kelvin)
     fill = np.clip(soc, 0.02, 0.98)
     exchange = pack.exchange_a * 2.0 * np.sqrt(fill * (1.0 - fill)) * np.exp(activation)
-    exchange /= (1.0 + condition.transfer_slowdown) * cold_resistance_factor(condition, kelvin)
-    ratio, eta = _overpotential_table(pack.anodic)
-    return np.interp(current_a / exchange, ratio, eta) * (_GAS_OVER_FARADAY_V_K * kelvin)
+    exchange /= slowdown
+    eta = np.sinh(np.linspace(-6.0, 6.0, 1201)) / np.sinh(6.0) * 30.0  # F·overpotential/RT
+    ratio = np.exp(pack.anodic * eta) - np.exp(-(1.0 - pack.anodic) * eta)
+    over = np.interp(current_a / exchange, ratio, eta)
+    return np.asarray(over * (_GAS_OVER_FARADAY_V_K * kelvin))
+
+
+def _added_drop(
+    drive: Drive, faults: Faults, current_a: FloatArray, kelvin: FloatArray
+) -> FloatArray:
+    """Return the voltage drop of faults around the cells [V], shape (n,)."""
+    # A rectifying contact, smooth over some amperes around 0.
+    charging = 0.5 * (1.0 - current_a / np.hypot(current_a, _BEND_A))
+    ohm = faults.size("resistance_asymmetry") * charging + faults.size("resistance_growth")
+    if (step := faults.get("resistance_step")) is not None:
+        ohm = ohm + step.size * (drive.time_s >= step.full_shape()["at_s"])
+    if (contact := faults.get("contact_flicker")) is not None:
+        ohm = ohm + contact.size * contact.is_active(drive.time_s)
+    drop = ohm * current_a
+    slower = np.exp(_ADDED_ACTIVATION_K * (1.0 / kelvin - 1.0 / REFERENCE_K))
+    for name, modes in (("fast_polarization", cole_cole), ("slow_diffusion", finite_warburg)):
+        if name in faults:
+            ohms, taus_s = modes(faults[name])
+            drop += relax(current_a, drive.step_s, slower[:, None] * taus_s) @ ohms
+    return np.asarray(drop)
+
+
+def cole_cole(fault: Fault) -> tuple[FloatArray, FloatArray]:
+    """Return resistances [Ω] and time constants [s] of a Cole–Cole element.
+
+    The distribution of relaxation times sin((1−α)π)/(cosh(α·ln τ/τ0) − cos((1−α)π)), sampled
+    within 1.6 e-folds of τ0 (Cole and Cole 1941).
+    """
+    shape = fault.full_shape()
+    alpha = shape["alpha"]
+    weight = 1.0 / (np.cosh(alpha * _COLE_SPREAD) - np.cos((1.0 - alpha) * np.pi))
+    return fault.size * weight / weight.sum(), shape["tau_s"] * np.exp(_COLE_SPREAD)
+
+
+def finite_warburg(fault: Fault) -> tuple[FloatArray, FloatArray]:
+    """Return the first six poles [Ω, s] of a finite-length Warburg element R·tanh(√jωτ)/√jωτ."""
+    weight = 1.0 / _WARBURG_POLES
+    taus_s = fault.full_shape()["tau_s"] / _WARBURG_POLES
+    return fault.size * weight / weight.sum(), taus_s
+
+
+def _hysteresis(drive: Drive, faults: Faults, charge: FloatArray) -> FloatArray | float:
+    """Return the voltage drop of hysteresis [V]: five stop operators on the charge.
+
+    Prandtl–Ishlinskii model: each operator follows the charge until it saturates at its reach.
+    """
+    if (fault := faults.get("hysteresis")) is None:
+        return 0.0
+    reach = fault.full_shape()["reach"] * _HYSTERESIS_REACHES
+    followed = [stopped(charge, each, drive.history * each) / each for each in reach.tolist()]
+    return np.asarray(fault.size * np.mean(followed, axis=0))
+
+
+def stopped(signal: FloatArray, reach: float, start: float = 0.0) -> FloatArray:
+    """Return the stop operator of a signal: from its start it follows, within ± its reach."""
+    states = [start]
+    for moved in np.diff(signal).tolist():
+        states.append(min(max(states[-1] + moved, -reach), reach))
+    return np.array(states)

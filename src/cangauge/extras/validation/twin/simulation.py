@@ -11,18 +11,17 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import require_number
 from cangauge.extras.validation.twin.drive import draw_drive
-from cangauge.extras.validation.twin.faults import Fault, parse_effect
-from cangauge.extras.validation.twin.pack import draw_pack
-from cangauge.extras.validation.twin.plant import Plant, TwinPlant
-from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, simulate_truth
-from cangauge.extras.validation.twin.scaling import ScaledFault, scale_to_gap
+from cangauge.extras.validation.twin.faults import Fault, is_reached, parse_effect
+from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
+from cangauge.extras.validation.twin.plant import simulate_truth
+from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, scale_to_gap
 from cangauge.logs.log import Log
 
 _DEFAULT_GAP: Final = 0.003
 """RMS gap of an effect without a size, relative to the nominal voltage [-]."""
 _DISCHARGE_HOURS: Final = 2.5
-_EMPTY: Final = 0.015
-"""SoC at which a full discharge ends [-]; `fit` takes 2 % and less as empty."""
+_EMPTY_PCT: Final = 1.5
+"""SoC at which a full discharge ends [%]; `fit` takes 2 % and less as empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +34,21 @@ class Simulation:
         As recorded by the sensors; `soc_pct` is the assumed initial SoC, then the true SoC.
     recording : Recording
         The same log with the assumed initial SoC alone, and the truth at its rows.
-    plant : Plant
-        Pack and cell model.
+    pack : TwinPack
     faults : tuple of Fault
-    limited : tuple of ScaledFault
+    notes : tuple of str
         Faults whose physical limits prevent the requested gap.
     """
 
     log: Log
     recording: Recording
-    plant: Plant
+    pack: TwinPack
     faults: tuple[Fault, ...]
-    limited: tuple[ScaledFault, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return pack, ranges of the signals, RMS gap [V] and the effects with their sizes."""
-        log, pack, recording = self.log, self.plant.pack, self.recording
-        assumed = log.first_soc()
+        log, pack, recording = self.log, self.pack, self.recording
         return {
             "rows": len(log),
             "hours": log.duration_s / 3600.0,
@@ -59,7 +56,7 @@ class Simulation:
             "chemistry": pack.chemistry.name,
             "cells": pack.cells,
             "capacity_ah": pack.capacity_ah,
-            "assumed_start_soc_pct": None if assumed is None else assumed[1],
+            "assumed_start_soc_pct": recording.assumed_start_pct,
             "true_soc_pct": [float(recording.true_soc_pct[0]), float(recording.true_soc_pct[-1])],
             "temperature_c": [float(log.temperature_c.min()), float(log.temperature_c.max())],
             "floor_sensor_v": rms(recording.sensor_error_v),
@@ -137,11 +134,11 @@ def simulate(
     if discharge:
         hours = _DISCHARGE_HOURS if hours is None else hours
         start_soc_pct = 100.0 if start_soc_pct is None else start_soc_pct
-        end_soc_pct = 100.0 * _EMPTY if end_soc_pct is None else end_soc_pct
-    model = draw_plant(np.random.default_rng([seed, 1]), pack, chemistry)
+        end_soc_pct = _EMPTY_PCT if end_soc_pct is None else end_soc_pct
+    drawn = draw_pack(np.random.default_rng([seed, 1]), pack, chemistry)
     load = draw_drive(
         np.random.default_rng([seed, 4, drive]),
-        model.pack,
+        drawn,
         hours=hours,
         ambient_c=ambient_c,
         start_soc=None if start_soc_pct is None else start_soc_pct / 100.0,
@@ -149,32 +146,22 @@ def simulate(
         speed_ms=speed_ms,
         discharge=discharge,
     )
-    healthy = simulate_truth(model, load)
+    healthy = simulate_truth(drawn, load)
     faults: list[Fault] = []
-    limited: list[ScaledFault] = []
+    notes: list[str] = []
     for number, text in enumerate([effects] if isinstance(effects, str) else effects):
-        fault, gap_v = parse_effect(
-            text,
-            model.pack,
-            seed=seed + 7919 * number,
-            default_gap_v=_DEFAULT_GAP * model.pack.nominal_v,
-        )
+        default_v = _DEFAULT_GAP * drawn.nominal_v
+        fault, gap_v = parse_effect(text, drawn, seed=seed + 7919 * number, default_gap_v=default_v)
         if gap_v is not None:
-            scaled = scale_to_gap(model, load, fault, gap_v, healthy)
-            fault = scaled.fault
-            if scaled.limited:
-                limited.append(scaled)
+            fault, reached_v = scale_to_gap(drawn, load, fault, gap_v, healthy)
+            if not is_reached(reached_v, gap_v):
+                notes.append(
+                    f"{fault.id}: on this drive its physical limits allow a gap of"
+                    f" {reached_v:.3g} V, not {gap_v:.3g} V"
+                )
         faults.append(fault)
-    recording = record_drive(model, load, faults, name=name, healthy=healthy)
+    recording = record_drive(drawn, load, faults, name=name, healthy=healthy)
     soc_pct = recording.true_soc_pct.copy()
-    if recording.log.soc_pct is not None:
-        soc_pct[0] = recording.log.soc_pct[0]  # assumed
+    soc_pct[0] = recording.assumed_start_pct
     log = replace(recording.log, soc_pct=soc_pct)
-    return Simulation(log, recording, model, tuple(faults), tuple(limited))
-
-
-def draw_plant(
-    rng: np.random.Generator, kind: str | None = None, chemistry_name: str | None = None
-) -> TwinPlant:
-    """Draw a pack and the model of its cells (parameters as in `simulate`)."""
-    return TwinPlant(draw_pack(rng, kind, chemistry_name))
+    return Simulation(log, recording, drawn, tuple(faults), tuple(notes))
