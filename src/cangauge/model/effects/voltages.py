@@ -35,9 +35,6 @@ MEAN_SLOPE_PCT: Final = (10.0, 90.0)
 STEEPNESS_AT_MOST: Final = 5.0
 """Upper limit of the slope, relative to the mean."""
 
-BEND_ZERO_C_RATE: Final = 1.0
-"""Current at which the bend alone is zero, as at rest [1/h]: a model identified on logs of the same
-pack already contains the mean slope over the currents of a drive."""
 ACTIVATION_K: Final = 5000.0
 """Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
 
@@ -102,7 +99,7 @@ def drop_after_step(load: Load, values: Values, at: Context) -> FloatArray:
 def bend(load: Load, values: Values, at: Context) -> FloatArray:
     """Return the bent part of charge transfer."""
     per_a = 0.5 / values["exchange_a"] * arrhenius(load.temperature_c, values["activation_k"])
-    zero_a = BEND_ZERO_C_RATE * at.pack.capacity_ah
+    zero_a = at.pack.capacity_ah
     slope = values["bend_only"] * np.arcsinh(zero_a * per_a) / zero_a
     bent = np.arcsinh(load.current_a * per_a) - slope * load.current_a
     return np.asarray(-values["scale_v"] * bent)
@@ -110,7 +107,7 @@ def bend(load: Load, values: Values, at: Context) -> FloatArray:
 
 def bend_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
     """Return charge transfer in the C core."""
-    rest = values["bend_only"], values["activation_k"], BEND_ZERO_C_RATE * pack.capacity_ah
+    rest = values["bend_only"], values["activation_k"], pack.capacity_ah
     return CoreForm("charge_transfer", (values["scale_v"], 0.5 / values["exchange_a"], *rest))
 
 
@@ -312,7 +309,8 @@ VOLTAGES: Final = (
         drive=drop_after_step,
         core_form=partial(core_values, "resistance_step", ("step_ohm", "start_s")),
     ),
-    # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted. `scale_v` is 2RT/F
+    # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted: a model identified on
+    # logs of the same pack has the mean slope over the currents of a drive already. `scale_v` is 2RT/F
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
     Effect(
         id="charge_transfer",
