@@ -16,7 +16,7 @@ from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.effects.base import Effect, Signals, Values
 from cangauge.model.effects.library import shape_key
 from cangauge.model.extended import ExtendedModel, Prediction
-from cangauge.model.prior import DELAYS_S
+from cangauge.model.voltage_model import DELAYS_S
 
 STEP_S: Final = 0.9
 """Logs with a shorter step are averaged over seconds [s]; a logger of 1 Hz jitters."""

@@ -46,8 +46,8 @@ from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import FunctionFields, Information, Made, Model, SourceLog
 from cangauge.model.noise import Noise
-from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior
-from cangauge.model.voltage_model import KNOTS_PCT, Ranges
+from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
+from cangauge.model.voltage_model import DELAYS_S, KNOTS_PCT, Ranges
 
 Equation = Literal["knots", "published"]
 

@@ -18,9 +18,9 @@ from cangauge.errors import InputError
 from cangauge.identify.least_squares import SECONDS_PER_DATUM
 from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
 from cangauge.model.model_file import Published
-from cangauge.model.prior import DELAYS_S
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
+    DELAYS_S,
     EDGE,
     KNOTS_PCT,
     REFERENCE_C,

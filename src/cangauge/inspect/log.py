@@ -31,7 +31,7 @@ from cangauge.logs.sign import (
     spaced_rows,
 )
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
-from cangauge.model.prior import DELAYS_S
+from cangauge.model.voltage_model import DELAYS_S
 from cangauge.settings import GAP_S
 from cangauge.types import SOC_WITHIN_PCT
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.model.voltage_model import (
+    DELAYS_S,
     KNOTS_PCT,
     LEAF_2012_CELLS,
     LEAF_2012_OCV_V,
@@ -37,8 +38,6 @@ from cangauge.model.voltage_model import (
 
 ChemistryName = Literal["oxide", "lfp"]
 
-DELAYS_S: Final[tuple[float, ...]] = Loads.model_fields["delays_s"].default
-"""The published delays of the current [s]."""
 LOW_PASS_S: Final = (10.0, 140.0)
 """Time constants of the low-passed currents [s]: the polarization of a drive has seconds to
 minutes, and 70 s of delays cannot express it."""

@@ -49,6 +49,9 @@ KNOTS_PCT: FloatArray = np.array(
 )
 """Knots of a fitted curve [% SoC]: every 5 %, closer where the curves of all chemistries bend."""
 
+DELAYS_S = (0.0, 10.0, 30.0, 70.0)
+"""The published delays of the current [s]."""
+
 BASIS_NAMES = ("k0", "k1", "k2", "k3", "k4", "k5", "k6", "k7")
 """Coefficients of the published pseudo-OCV, in the order of the columns of `ocv_basis`."""
 
@@ -421,8 +424,8 @@ class Loads(Fields):
     """Reference temperature T_r [°C]."""
     kt_v_per_k: Value
     """Temperature coefficient [V/K]."""
-    delays_s: Delays = (0.0, 10.0, 30.0, 70.0)
-    """Delays of the current [s]: by default the published ones."""
+    delays_s: Delays = DELAYS_S
+    """Delays of the current [s]."""
     low_pass_s: tuple[Seconds, ...] = ()
     """Time constants of the low-passed currents [s]."""
     resistance_ohm: tuple[Value, ...]

@@ -309,9 +309,9 @@ VOLTAGES: Final = (
         drive=drop_after_step,
         core_form=partial(core_values, "resistance_step", ("step_ohm", "start_s")),
     ),
-    # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted: a model identified on
-    # logs of the same pack has the mean slope over the currents of a drive already. `scale_v` is 2RT/F
-    # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
+    # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted: a model identified
+    # on logs of the same pack has the mean slope over the currents of a drive already. `scale_v` is
+    # 2RT/F per electrode (51 mV at 25 °C) times the cells in series; the bound allows two.
     Effect(
         id="charge_transfer",
         fault="resistance",
