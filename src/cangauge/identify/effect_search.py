@@ -113,13 +113,14 @@ def parse_effect_ids(given: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class SearchStep:
-    """One effect added, or the best one that was not.
+    """One effect added, or the best one that was not: an entry of `fit --json`.
 
     Parameters
     ----------
-    what : {"added", "not added"}
-    effect_id : str
-    before_rmse_v, after_rmse_v : float
+    step : {"added", "not added"}
+    effect : str
+        Its id.
+    held_out_rmse_without_v, held_out_rmse_with_v : float
         Error of left-out logs [V].
     gain : float
         Mean of ln(mean square error without / with) of the left-out logs.
@@ -127,10 +128,10 @@ class SearchStep:
         Gain over its standard error, and what is significant for this many logs and effects.
     """
 
-    what: str
-    effect_id: str
-    before_rmse_v: float
-    after_rmse_v: float
+    step: str
+    effect: str
+    held_out_rmse_without_v: float
+    held_out_rmse_with_v: float
     gain: float
     t_value: float
     t_needed: float
@@ -139,17 +140,6 @@ class SearchStep:
     def is_worth(self) -> bool:
         """Whether the gain is significant and worthwhile."""
         return self.t_value >= self.t_needed and self.gain >= GAIN_AT_LEAST
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the step for `fit --json`."""
-        return {
-            "step": self.what,
-            "effect": self.effect_id,
-            "held_out_rmse_without_v": self.before_rmse_v,
-            "held_out_rmse_with_v": self.after_rmse_v,
-            "t_value": self.t_value,
-            "t_needed": self.t_needed,
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,8 +343,8 @@ class Search:
                 steps += [step for _, step, _ in compared[:1]]
                 break
             number, step, before = worth[0]
-            steps.append(replace(step, what="added"))
-            _LOG.info("effect %s: left-out error %.4g V", step.effect_id, step.after_rmse_v)
+            steps.append(replace(step, step="added"))
+            _LOG.info("effect %s: left-out error %.4g V", step.effect, step.held_out_rmse_with_v)
             chosen.append(number)
         return replace(self._selected(chosen), steps=tuple(steps))
 

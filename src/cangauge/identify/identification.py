@@ -341,9 +341,7 @@ class Identification:
                 for item, start in zip(self.fits, self.starts, strict=True)
             ],
             "effects": model.effects,
-            "effect_search": [step.to_dict() for step in self.effects.steps]
-            if self.effects
-            else [],
+            "effect_search": [vars(step) for step in self.effects.steps] if self.effects else [],
             "remarks": list(self.remarks),
         }
 

@@ -416,10 +416,10 @@ def _effects(result: Identification) -> list[Block]:
     ]
     steps = [
         {
-            "effect": step.effect_id,
-            "step": step.what,
-            "left out without [V]": significant(step.before_rmse_v, 3),
-            "with [V]": significant(step.after_rmse_v, 3),
+            "effect": step.effect,
+            "step": step.step,
+            "left out without [V]": significant(step.held_out_rmse_without_v, 3),
+            "with [V]": significant(step.held_out_rmse_with_v, 3),
             "t": number(step.t_value, 1),
         }
         for step in result.effects.steps
