@@ -234,10 +234,12 @@ class SocFilter:
         The variance contains the square of the error that the learned capacity and resistance
         imply for the SoC, which counts with those of the model.
         """
-        F = np.array([1.0, 100.0 * seconds / (3600.0 * self.model.capacity_ah)])  # of S and o
-        variance = F @ self.P[:2, :2] @ F + DRIFT_PCT2_PER_S * seconds + variance_pct2
+        a = 100.0 * seconds / (3600.0 * self.model.capacity_ah)
+        x, P = self.x, self.P
+        variance = P[SOC, SOC] + 2.0 * a * P[SOC, OFFSET] + a * a * P[OFFSET, OFFSET]
+        variance += DRIFT_PCT2_PER_S * seconds + variance_pct2
         variance += (self.bias.V[SOC] @ self.bias.b) ** 2
-        return float(F @ self.x[:2]) - discharged_pct, float(variance)
+        return float(x[SOC] + a * x[OFFSET] - discharged_pct), float(variance)
 
     @property
     def normalised_innovation_squared(self) -> float:
