@@ -121,6 +121,27 @@ def test_a_flood_and_single_false_frames_are_reported(
     assert decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
 
 
+# Without a stated period, frames show it before the flood.
+@pytest.mark.parametrize(("vehicle", "begins"), [(LEAF, 0), (LEAF, FROM), (GENERIC, FROM)])
+@pytest.mark.parametrize("times", [2, 5, 10])
+@pytest.mark.parametrize("ahead", [1, 2, 3])
+def test_a_flood_that_begins_anew_at_each_true_frame_is_reported(
+    vehicle: Vehicle, times: int, ahead: int, begins: int
+) -> None:
+    period_s, rule, out, number = PERIODS_S[vehicle.name], rule_of(vehicle), [], 0
+    for frame in true_frames(vehicle):
+        out.append(frame)
+        number += frame.arbitration_id == vehicle.current.arbitration_id
+        if frame.arbitration_id == vehicle.current.arbitration_id and number > begins:
+            out += [
+                forged(frame, rule, ahead + place, (place + 1) * 0.4 * period_s / times)
+                for place in range(times)
+            ]
+    decoder, first = decoded(vehicle, sorted(out, key=lambda each: each.timestamp))
+    assert begins <= first <= begins + 200
+    assert decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
+
+
 def test_message_is_used_again_after_the_second_sender() -> None:
     frames = attacked(LEAF, 0, 0.3)
     last_s = frames[-1].timestamp
@@ -201,7 +222,16 @@ def every(part: int, of: int) -> Callable[[list[can.Message], Random], Iterator[
     return change
 
 
+def faster(frames: list[can.Message], rng: Random) -> Iterator[can.Message]:
+    """Send three times as often as stated, with losses."""
+    for frame in frames:
+        frame.timestamp = BEGINS_S + (frame.timestamp - BEGINS_S) / 3.0
+        if rng.random() < 0.98:
+            yield frame
+
+
 LAWFUL = {
+    "faster than stated": faster,
     "identical copies": copies,
     "40 % lost": lossy,
     "damaged frames between": damaged,

@@ -287,11 +287,15 @@ WIDE: Final = 256
 """A counter with at least this many values does not wrap within a normal loss. If it steps back
 sooner, the sender restarted or frames came out of order: no loss is proven."""
 TWO_SENDERS: Final = 12.0
-"""Frames out of sequence that go on with the sequence left before, too early for one sender, from
-which there are two senders. Any other frame out of sequence takes back 12 / `modulus` of them.
-Where losses are random, one in `modulus` goes on by chance; they then reach 12 with a probability
-of 7e-8 with a counter of two bits, less with a longer one (Wald's bound θ⁻¹², with θ from
-θ/m + (1 - 1/m) θ^(-12/m) = 1)."""
+"""Frames out of sequence that one sender cannot have sent, from which there are two. Any other
+frame out of sequence takes back 12 / `modulus` of them. Where losses are random, one in `modulus`
+seems to go on with the sequence left before; they then reach 12 with a probability of 7e-8 with a
+counter of two bits, less with a longer one (Wald's bound θ⁻¹², with θ from
+θ/m + (1 - 1/m) θ^(-12/m) = 1). Also the frames beyond one sender's rate that are too many."""
+CROWDED: Final = 1.5
+"""Frames per period that are too many for one sender and its jitter: two send 2 or more."""
+RUN: Final = 64
+"""Frames in sequence that show the period of their sender: others would lie between them."""
 
 
 class FrameChecker:
@@ -324,6 +328,11 @@ class FrameChecker:
         self._step_s = math.inf  # between the latest two frames in sequence
         self._content: bytes | bytearray = b""
         self._is_repeated = False
+        # A stated period beyond a silence is of another unit.
+        is_stated = period_s is not None and period_s <= SILENCE_S
+        self._sent_every_s = period_s if is_stated else 0.0
+        self._surplus = 0.0
+        self._run, self._run_s = 0, 0.0
         self.lost = 0
         self.learned_period_s: Callable[[], float] = lambda: math.nan
 
@@ -344,6 +353,7 @@ class FrameChecker:
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         self.lost = 0
+        self._note_rate(elapsed_s, in_sequence=steps == 1 and last >= 0)
         if steps == 1 or last < 0:
             self._is_repeated = False
             if last >= 0 and elapsed_s > 0.0:  # 0: delivered together
@@ -357,7 +367,8 @@ class FrameChecker:
             is_early = elapsed_s < ((steps or modulus) - 0.5) * period_s < math.inf
             if not (steps == 0 and data == self._content):
                 is_other = goes_on or (self._is_repeated and not was_repeated)
-                score = 1.0 if is_other and is_early else -TWO_SENDERS / modulus
+                is_proof = (is_other and is_early) or self._surplus > TWO_SENDERS
+                score = 1.0 if is_proof else -TWO_SENDERS / modulus
                 self._of_others = max(self._of_others + score, 0.0)
             if self._is_repeated:
                 return Verdict.REPEATED
@@ -370,6 +381,19 @@ class FrameChecker:
             self.lost = self._lost(steps, elapsed_s)
         self._last, self._refused, self._content = counter, 0, data
         return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD
+
+    def _note_rate(self, elapsed_s: float, *, in_sequence: bool) -> None:
+        """Count frames beyond those that one sender sends, less what it owes since a silence."""
+        if period_s := self._sent_every_s:
+            surplus = self._surplus + 1.0 - CROWDED * elapsed_s / period_s
+            self._surplus = max(surplus, -SILENCE_S / period_s)
+        if not in_sequence:
+            self._run, self._run_s = 0, 0.0
+            return
+        self._run, self._run_s = self._run + 1, self._run_s + elapsed_s
+        if self._run == RUN:
+            self._sent_every_s = min(self._run_s / RUN, SILENCE_S)
+            self._run, self._run_s = 0, 0.0
 
     def _least_period_s(self) -> float:
         """Return the shorter of the stated and the learned period [s]; infinite: none is known.
