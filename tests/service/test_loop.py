@@ -130,6 +130,24 @@ def test_backlog_is_stale_until_it_is_processed(stamps: Stamps) -> None:
         assert not any(each.reasons & Reason.INPUT_STALE for each in behind[1:])
 
 
+def test_a_process_stopped_for_ten_minutes_knows_what_it_missed() -> None:
+    """It is stopped at 3 s; the kernel's queue holds one second, and is full for the rest."""
+    frames = [*frames_every(0.02, 4.0), *frames_every(0.02, 620.0, from_s=603.1)]
+    port = SimulatedPort(frames)
+    port.capabilities = BackendCapabilities("kernel", echoes=False, has_error_classes=False)
+    port.suspended_s = (3.0, 600.0)
+    port.work_s = lambda since_s: 0.005 if since_s < 603.5 else 0.0
+    simulate(port, 620.0)
+    behind = [content for at_s, content in port.published if 603.0 < at_s < 603.3]
+    after = [content for at_s, content in port.published if at_s > 615.0]
+    assert behind
+    assert all(each.status is not Status.VALID for each in behind)
+    assert all(each.reasons & Reason.INPUT_STALE for each in behind)
+    assert not any(each.reasons & Reason.INPUT_STALE for each in after)
+    assert all(each.reasons & Reason.CURRENT_GAP for each in after[-10:])
+    assert all(each.status is not Status.VALID for each in after[-10:])
+
+
 def test_ends_after_duration_or_when_idle() -> None:
     port = simulate(SimulatedPort([]), LoopSettings(duration_s=0.3, until_idle_s=0.1))
     assert port.since_s == pytest.approx(0.3, abs=0.1)  # idle before the first sample: no end
