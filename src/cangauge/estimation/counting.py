@@ -22,25 +22,28 @@ from typing import Final, NamedTuple
 
 from cangauge.logs.gaps import BRIDGE_S
 
-USE_S = 120.0
-"""How long the current before an unobserved interval may have continued into it [s]."""
+USE_S: Final = 120.0
+"""Time for which the current before an unobserved interval may have continued into it [s]: two
+minutes of driving that nobody saw."""
 
 UNKNOWN_STD_PCT: Final = math.sqrt(2000.0)
 """Standard deviation of an unknown SoC [%]: wider than 0–100 % (uniform: 29 %), so that the voltage
 decides."""
 
-DRAIN_PCT_PER_HOUR = 0.05
-DRAIN_AT_MOST_PCT = 5.0
-"""Self-discharge and consumers of a parked car [% per hour; %]: 1.2 % a day."""
+DRAIN_PCT_PER_HOUR: Final = 0.05
+DRAIN_AT_MOST_PCT: Final = 5.0
+"""Self-discharge and consumers of a parked car [% per hour; %]: 1.2 % a day. More than
+the 5 % is left to the hypothesis that the car was used."""
 
-FASTEST_PCT_PER_HOUR = 150.0
-"""Fastest unobserved change of SoC [% per hour]: a fast charger."""
+FASTEST_PCT_PER_HOUR: Final = 150.0
+"""Fastest unobserved change of SoC [% per hour]: a fast charger, from empty to full in 40 min."""
 
-MEAN_SQUARE_MEMORY_S = 300.0
-"""Memory of the mean square current, from which a gap's uncertainty follows [s]."""
+MEAN_SQUARE_MEMORY_S: Final = 300.0
+"""Memory of the mean square current, from which a gap's uncertainty follows [s]: long against a
+manoeuvre, short against a drive."""
 
-HELD_S = 5.0
-"""How long a current stays similar while driving [s]."""
+HELD_S: Final = 5.0
+"""Correlation time of the current of a drive [s]: pedal and traffic change it within seconds."""
 
 
 def parked_std_pct(seconds: float, rms_pct_per_s: float) -> float:
@@ -66,7 +69,8 @@ def moved_std_pct(seconds: float) -> float:
 OFFSET_STD_PER_AH: Final = 0.025
 CAPACITY_STD: Final = 0.05
 """Standard deviations of the sensor's offset [A/Ah] and of the capacity [relative], for counting
-alone."""
+alone: 1.5 A at 60 Ah, within the offsets of data sheets (`ekf.OFFSET_STD_A`), and some years of
+ageing."""
 
 
 def count_std_pct(start_var_pct2: float, seconds: float, moved_pct: float) -> float:
@@ -179,28 +183,31 @@ class CoulombCounter:
         return min(rms_a * seconds * self.pct_per_as, UNKNOWN_STD_PCT)
 
 
-LATEST_S = 1e11
+LATEST_S: Final = 1e11
 """Largest stamp accepted [s] (the year 5138)."""
 
-SHORTEST_STEP_S = 1e-7
+SHORTEST_STEP_S: Final = 1e-7
 """Samples closer than this have the same time [s]; stamps are whole microseconds."""
 
-SET_BACK_S = 1.0
-"""A stamp this much before the last one may come from a clock that was set back [s]."""
+SET_BACK_S: Final = 1.0
+"""A stamp this much before the last one may come from a clock that was set back [s]: more than the
+jitter of any gateway."""
 
-SET_BACK_SAMPLES = 5
+SET_BACK_SAMPLES: Final = 5
 """Number of consecutive, increasing stamps of that kind that prove it; time then continues from
 the last sample. Fewer are late or damaged samples, and refused."""
 
-EARLY_S = 5.0
-"""Tolerance of the stamps against the known length of an interruption [s]."""
+EARLY_S: Final = 5.0
+"""Tolerance of the stamps against the known length of an interruption [s]: the time of a
+state is that of its writing, its last stamp that of the sample before."""
 
-SHORTEST_INTERRUPTION_S = 1e-3
-LONGEST_INTERRUPTION_S = 30.0 * 86400.0
+SHORTEST_INTERRUPTION_S: Final = 1e-3
+LONGEST_INTERRUPTION_S: Final = 30.0 * 86400.0
 """Bounds of an interruption's length [s]; a longer step may be a faulty clock."""
 
-UNKNOWN_INTERRUPTION_S = 86400.0
-"""Assumed length of an interruption that no clock measured [s]."""
+UNKNOWN_INTERRUPTION_S: Final = 86400.0
+"""Assumed length of an interruption that no clock measured [s]: a day, in which any charge may have
+flowed (`FASTEST_PCT_PER_HOUR`)."""
 
 
 @dataclass

@@ -53,8 +53,8 @@ none on development months; the shortest is the least sure of itself."""
 
 FUNCTIONS_TIME_S: Final = 72.0 * 3600.0
 """Time constant of the functions [s]: temperature and use of a car change within days, and with
-them the errors of its model. On development months 6 to 240 h are all better than
-none; this one has the fewest wrong valid estimates."""
+them the errors of its model. On development months 6 to 240 h are all better than none. 72 h has
+the fewest wrong valid estimates (mean error 1.98 %; 24 h: 2.04 %)."""
 
 DRIFT_PCT2_PER_S: Final = 1e-6
 """Growth of the SoC's variance by self-discharge and unmeasured consumers [%²/s]: 0.06 % in the
@@ -71,7 +71,8 @@ changes little within it."""
 
 ITERATIONS_AT_MOST: Final = 8
 CLOSE_PCT: Final = 0.05
-"""Iterations, and the change of the SoC that ends them [%]: less than any σ of the filter."""
+"""Iterations, and the change of the SoC that ends them [%]: less than any σ of the filter. Newton's
+method doubles its digits with each, so that eight are needed only where the curve has a kink."""
 
 LOWEST_PCT: Final = -25.0
 HIGHEST_PCT: Final = 125.0
@@ -87,10 +88,12 @@ SOC, OFFSET, SLOW, LEVEL, FUNCTIONS = range(5)
 
 
 class SocFilter:
-    """Kalman filter from one start, in filterpy's names: x, P, F, Q, H, R, K, y and S.
+    """Extended Kalman filter from one start; equations and symbols are in the module's docstring.
 
-    The prediction is filterpy's, which is imported with the first one: a service whose steps are
-    compiled never makes one here. `update` takes a block and repeats itself where the curve bends.
+    `predict` moves the state over counted charge, `update` corrects it by the mean voltage of a
+    block, `correct` by a SoC that is known otherwise. Between blocks `soc_after` counts the SoC on.
+    x, P, F, Q, H, R, K, y and S are filterpy's names. Its prediction is used, and imported with the
+    first one: a service whose steps are compiled never makes one here.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, detect_references, since
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
-from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
+from cangauge.estimation.validity import drop_implausible, temperature_mismatch
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
@@ -461,6 +461,7 @@ class Estimator:
         """Return the estimate after a corrected sample."""
         memory, line, time_s = self._memory, self.online.delay_line, sample.time_s
         soc_pct, std_pct = self._soc()
+        known = self.voltage_model.range
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
         bits = int(self._mismatch) | int(implausible)
         for is_set, reason in (
@@ -474,10 +475,16 @@ class Estimator:
             (time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
             (time_s < memory.mismatch_until_s, Reason.MODEL_MISMATCH),
             (memory.is_sign_wrong, Reason.SIGN_SUSPECT),
+            (_is_outside(soc_pct, known.soc_pct), Reason.SOC_OUTSIDE_MODEL),
+            (
+                _is_outside(sample.temperature_c, known.temperature_c),
+                Reason.TEMPERATURE_OUTSIDE_MODEL,
+            ),
+            (_is_outside(sample.current_a, known.current_a), Reason.CURRENT_OUTSIDE_MODEL),
         ):
             if is_set:
                 bits |= int(reason)
-        reasons = REASONS[bits | int(outside_model(self.voltage_model, soc_pct, sample))]
+        reasons = REASONS[bits]
         return Estimate(
             time_s,
             soc_pct,
@@ -625,6 +632,11 @@ class Estimator:
         *numbers, status, reasons, samples = parts["latest"]
         self._latest = Estimate._make([*numbers, Status(status), Reason(reasons), samples])
         self.is_refused = False
+
+
+def _is_outside(value: float, within: tuple[float, float]) -> bool:
+    """Return whether a value is below or above a range; NaN is not."""
+    return value < within[0] or value > within[1]
 
 
 def _clip(soc_pct: float) -> float:

@@ -1,11 +1,10 @@
-"""What makes a sample implausible, or a model not identified at it."""
+"""Implausible samples, and temperatures of another place than the model's."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-from cangauge.model.voltage_model import VoltageModel
 from cangauge.settings import TemperatureSource
 from cangauge.types import TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason, Sample
 
@@ -28,19 +27,6 @@ def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
             sample = sample._replace(**{name: math.nan})
             reason = Reason.IMPLAUSIBLE_INPUT
     return sample, reason
-
-
-def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason:
-    """Return which of SoC, temperature and current the model was not identified at (NaN: none)."""
-    reasons = _NO_REASON
-    for value, (low, high), reason in (
-        (soc_pct, model.range.soc_pct, Reason.SOC_OUTSIDE_MODEL),
-        (sample.temperature_c, model.range.temperature_c, Reason.TEMPERATURE_OUTSIDE_MODEL),
-        (sample.current_a, model.range.current_a, Reason.CURRENT_OUTSIDE_MODEL),
-    ):
-        if value < low or value > high:
-            reasons |= reason
-    return reasons
 
 
 def temperature_mismatch(of_model: TemperatureSource, of_input: TemperatureSource) -> Reason:

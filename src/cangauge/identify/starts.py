@@ -17,6 +17,7 @@ import numpy as np
 from scipy import optimize
 
 from cangauge._text import significant
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import (
     LogSums,
@@ -143,7 +144,7 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], pack: PackPr
     if not known:
         raise unknown_start(pieces[0], others=len(pieces) > 1)
     unknown = [log for log, start in zip(pieces, starts, strict=True) if start is None]
-    estimated = iter(_JointFit(known, unknown, pack).solve() if unknown else ())
+    estimated = iter(_estimated(known, unknown, pack) if unknown else ())
     return [start or next(estimated) for start in starts]
 
 
@@ -160,81 +161,84 @@ def unknown_start(log: Log, *, others: bool) -> InputError:
     )
 
 
-class _JointFit:
-    """Fit of the curve and of unknown starts in turn."""
+@dataclass(frozen=True, eq=False)
+class _Unknown:
+    """A log of unknown start: its rows, counted from a start in the middle of the possible ones."""
 
-    def __init__(self, pinned: Sequence[Log], unknown: Sequence[Log], pack: PackPrior) -> None:
-        self._pack, self._chemistry = pack, pack.chemistry
-        capacity_ah = pack.capacity_ah
-        self._pinned = [log_sums(fit_rows(log, capacity_ah), pack.chemistry) for log in pinned]
-        self._logs = unknown
-        self._limits = [_limits(log, capacity_ah) for log in unknown]
-        self._rows = [
-            fit_rows(with_start(log, 0.5 * sum(limits)), capacity_ah)
-            for log, limits in zip(unknown, self._limits, strict=True)
-        ]
+    log: Log
+    rows: FitRows
+    low: float
+    high: float
 
-    def solve(self) -> list[Start]:
-        sums = self._pinned
-        values = [float("nan")] * len(self._logs)
-        for _ in range(STEPS_AT_MOST):
-            solution = solve(sums, self._pack)
-            before = values
-            values = [self._best(number, solution) for number in range(len(self._logs))]
-            sums = self._pinned + [
-                log_sums(self._at(number, value), self._chemistry)
-                for number, value in enumerate(values)
-            ]
-            moved = np.abs(np.array(values) - before)
-            if np.all(moved < CONVERGED_PCT):
-                break
-        pinned = solve(self._pinned, self._pack)
-        of_unknown = sums[len(self._pinned) :]
-        return [
-            self._start(log, value, self._std_pct(of_log, pinned))
-            for log, value, of_log in zip(self._logs, values, of_unknown, strict=True)
-        ]
+    @classmethod
+    def of(cls, log: Log, capacity_ah: float) -> _Unknown:
+        low, high = _limits(log, capacity_ah)
+        return cls(log, fit_rows(with_start(log, 0.5 * (low + high)), capacity_ah), low, high)
 
-    def _start(self, log: Log, soc_pct: float, std_pct: float) -> Start:
-        if not std_pct <= STD_AT_MOST_PCT:
-            raise InputError(
-                "the SoC at the start is unknown, and the voltage determines it to"
-                f" ±{std_pct:.0f} % only",
-                source=log.source or log.name,
-                field="soc_pct",
-                cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
-            )
-        start = Start(with_start(log, soc_pct), soc_pct, "estimated", std_pct)
-        _LOG.info("%s", start)
-        return start
+    def soc_pct(self, start_pct: float) -> FloatArray:
+        """Return the SoC of the rows from a start [%]."""
+        return self.rows.soc_pct + start_pct - 0.5 * (self.low + self.high)
 
-    def _at(self, number: int, start_pct: float) -> FitRows:
-        rows = self._rows[number]
-        return replace(rows, soc_pct=rows.soc_pct + start_pct - 0.5 * sum(self._limits[number]))
+    def sums(self, start_pct: float, pack: PackPrior) -> LogSums:
+        """Return the sums of the log from a start [%]."""
+        return log_sums(replace(self.rows, soc_pct=self.soc_pct(start_pct)), pack.chemistry)
 
-    def _best(self, number: int, solution: Solution) -> float:
-        rows = self._rows[number]
+    def best_pct(self, solution: Solution, pack: PackPrior) -> float:
+        """Return the start at which a solution misfits the voltage least [%]."""
+        rows, chemistry = self.rows, pack.chemistry
         curve = HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N])
         loads = load_features(rows.dequantized_c, rows.currents_a) @ solution.select[N:, N:].T
         open_v = rows.voltage_v - loads @ solution.coefficients[N:]
-        level2 = (self._chemistry.level_std * solution.mean_v) ** 2
+        level2 = (chemistry.level_std * solution.mean_v) ** 2
 
         def misfit(start_pct: float) -> float:
-            at = self._at(number, start_pct)
-            error = open_v - curve.values(at.soc_pct)
-            weight = row_weights(at.soc_pct, at.row_s, self._chemistry) + 1e-9
+            soc_pct = self.soc_pct(start_pct)
+            error = open_v - curve.values(soc_pct)
+            weight = row_weights(soc_pct, rows.row_s, chemistry) + 1e-9
             mean = float(weight @ error / weight.sum())
             square = float(weight @ (error - mean) ** 2 / weight.sum())
             return square / (solution.residual_v**2 + 1e-12) + mean**2 / level2
 
-        return _minimum(misfit, *self._limits[number])
+        return _minimum(misfit, self.low, self.high)
 
-    def _std_pct(self, sums: LogSums, solution: Solution) -> float:
+    def start(self, soc_pct: float, solution: Solution, pack: PackPrior) -> Start:
+        """Return an estimated start [%]; raise InputError if a solution does not determine it."""
+        sums = self.sums(soc_pct, pack)
         variance = float(solution.mean_error(sums)[1])
-        variance += (self._chemistry.level_std * solution.mean_v) ** 2
-        mean_pct = np.array([sums.mean_soc_pct])
-        slope = float(HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N]).slopes(mean_pct)[0])
-        return float(variance**0.5) / max(slope, SLOPE_AT_LEAST * solution.mean_v)
+        variance += (pack.chemistry.level_std * solution.mean_v) ** 2
+        curve = HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N])
+        slope = max(curve.at(sums.mean_soc_pct)[1], SLOPE_AT_LEAST * solution.mean_v)
+        std_pct = float(variance**0.5) / slope
+        if not std_pct <= STD_AT_MOST_PCT:
+            raise InputError(
+                "the SoC at the start is unknown, and the voltage determines it to"
+                f" ±{std_pct:.0f} % only",
+                source=self.log.source or self.log.name,
+                field="soc_pct",
+                cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
+            )
+        start = Start(with_start(self.log, soc_pct), soc_pct, "estimated", std_pct)
+        _LOG.info("%s", start)
+        return start
+
+
+def _estimated(known: Sequence[Log], logs: Sequence[Log], pack: PackPrior) -> list[Start]:
+    """Return the starts of logs, found in turn with the curve, which the known logs pin."""
+    pinned = [log_sums(fit_rows(log, pack.capacity_ah), pack.chemistry) for log in known]
+    unknown = [_Unknown.of(log, pack.capacity_ah) for log in logs]
+    sums, values = pinned, np.full(len(logs), np.nan)
+    for _ in range(STEPS_AT_MOST):
+        solution, before = solve(sums, pack), values
+        values = np.array([each.best_pct(solution, pack) for each in unknown])
+        if np.all(np.abs(values - before) < CONVERGED_PCT):
+            break
+        found = zip(unknown, values.tolist(), strict=True)
+        sums = [*pinned, *(each.sums(value, pack) for each, value in found)]
+    by_known = solve(pinned, pack)
+    return [
+        each.start(value, by_known, pack)
+        for each, value in zip(unknown, values.tolist(), strict=True)
+    ]
 
 
 def _minimum(misfit: Callable[[float], float], low: float, high: float) -> float:

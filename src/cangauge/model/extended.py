@@ -137,7 +137,10 @@ class ExtendedModel:
         for effect, values in effects:
             context = effect.context(values, model, pack)._replace(is_whole=True)
             signals = effect.correct(signals, values, context)
-        soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
+        counting = self.counting(initial_soc_pct)
+        out_ah = discharged_ah(signals.time_s, counting.counted(signals.current_a))
+        moved_pct = 100.0 * (out_ah - out_ah[initial_row]) / counting.capacity_ah
+        soc = np.asarray(counting.initial_soc_pct - moved_pct)
         every = any(effect.adds_voltage for effect, _ in effects)
         rows = slice(None) if every else at_rows
         if currents_a is not None and signals.current_a is measured_a:
@@ -182,15 +185,6 @@ class ExtendedModel:
         for effect, values in self.effects:
             counting = effect.count(counting, values)
         return counting
-
-    def counted_soc(
-        self, corrected: Signals, initial_soc_pct: float, *, initial_row: int = 0
-    ) -> FloatArray:
-        """Return the SoC counted from corrected signals [%], shape (n,)."""
-        counting = self.counting(initial_soc_pct)
-        out = discharged_ah(corrected.time_s, counting.counted(corrected.current_a))
-        moved = 100.0 * (out - out[initial_row]) / counting.capacity_ah
-        return np.asarray(counting.initial_soc_pct - moved)
 
 
 BISECTIONS = 45

@@ -165,7 +165,7 @@ def counted(effect_id: str, values: Values, current_a: float, hours: float) -> f
     state = steady(3600.0 * hours, current_a)
     signals = Signals(state.time_s, state.current_a, state.current_a, state.temperature_c)
     extended = ExtendedModel(MODEL, 50.0).with_effect(LIBRARY[effect_id], values)
-    return float(extended.counted_soc(signals, 60.0)[-1])
+    return float(extended.predict(signals, 60.0, np.array([0])).soc_pct[-1])
 
 
 def test_charge_effects_change_the_count() -> None:

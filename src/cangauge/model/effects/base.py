@@ -109,7 +109,7 @@ class Parameter:
     neutral : float
         Value of an amplitude at which the effect does nothing.
     grid : tuple of floats, optional
-        Trial values of a shape, the usual one in the middle; () for an amplitude.
+        Trial values of a shape, of which the middle one is neutral; () for an amplitude.
     from_pack : {"temperature_c"}, optional
         Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
     healthy_std : float
@@ -239,10 +239,10 @@ class Context(NamedTuple):
 
 
 def core_values(
-    kind: str, names: Sequence[str], values: Values, _: VoltageModel, pack: Pack
+    kind: str, names: Sequence[str], values: Values, model: VoltageModel, pack: Pack
 ) -> CoreForm:
-    """Return a form in the C core whose constants are parameters, or sizes of the pack."""
-    known = {**vars(pack), **values}
+    """Return a form in the C core whose constants are parameters, sizes of the pack or T_r."""
+    known = {**vars(pack), "t_ref_c": model.loads.t_ref_c, **values}
     return CoreForm(kind, tuple(known[name] for name in names))
 
 

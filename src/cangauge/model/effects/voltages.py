@@ -181,12 +181,6 @@ def entropic_v_per_k(soc_pct: FloatArray, values: Values, _: VoltageModel) -> Fl
     return np.asarray(shape + values["curve_v_per_k"] * (1.5 * x * x - 0.5))
 
 
-def entropic_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
-    """Return the entropic coefficient in the C core."""
-    level, slope, curve = (values[f"{name}_v_per_k"] for name in ("level", "slope", "curve"))
-    return CoreForm("entropic", (level, slope, curve, model.loads.t_ref_c))
-
-
 def fraction(load: Load, values: Values, _: Context) -> FloatArray:
     """Return the fraction of weak cells, at every row."""
     return np.full_like(load.current_a, values["fraction"])
@@ -432,7 +426,11 @@ VOLTAGES: Final = (
         ),
         drive=warmer_k,
         over_soc=entropic_v_per_k,
-        core_form=entropic_form,
+        core_form=partial(
+            core_values,
+            "entropic",
+            ("level_v_per_k", "slope_v_per_k", "curve_v_per_k", "t_ref_c"),
+        ),
     ),
     # From full the SoC of the weak cells falls faster. Below empty they follow the model's linear
     # extrapolation. A reversed cell falls faster, but a pack is switched off before that.
