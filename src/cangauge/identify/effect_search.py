@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -316,11 +317,10 @@ class Search:
         self._is_auto = tuple(effect_ids) == (AUTO,)
         self._at_most = EFFECTS_AT_MOST if self._is_auto else len(effect_ids)
         self._pack = pack
-        self._offered = offered(SEARCHED if self._is_auto else effect_ids, model)
-        chance = SIGNIFICANCE / max(len({item.effect.id for item in self._offered}), 1)
+        every = Selected(tuple(offered(SEARCHED if self._is_auto else effect_ids, model)))
+        chance = SIGNIFICANCE / max(len({item.effect.id for item in every.chosen}), 1)
         self._t_needed = float(stats.t.isf(chance, max(len(rows) - 1, 1)))
-        every = Selected(tuple(self._offered))
-        self._places = [part.tolist() for _, part in every.with_parts(np.arange(len(every.bounds)))]
+        self._columns = dict(every.with_parts(np.arange(len(every.bounds))))
         self.refused: list[EffectCandidate] = []
         """Candidates that are not offered any more."""
         self._sums: list[LogSums] = []
@@ -331,69 +331,65 @@ class Search:
 
     def select(self) -> Selected:
         """Return the effects; those asked for by id are all taken, in their best shapes."""
-        chosen: list[int] = []
+        chosen: list[EffectCandidate] = []
         steps: list[SearchStep] = []
         if self._is_auto and len(self._sums) < LOGS_AT_LEAST:
             return Selected(())
         before = self._left_out(chosen)
         while len(chosen) < self._at_most:
             compared = self._compared(chosen, before)
-            worth = [item for item in compared if item[1].is_worth or not self._is_auto]
+            worth = [each for each in compared if each[1].is_worth or not self._is_auto]
             if not worth:
                 steps += [step for _, step, _ in compared[:1]]
                 break
-            number, step, before = worth[0]
+            item, step, before = worth[0]
             steps.append(replace(step, step="added"))
             _LOG.info("effect %s: left-out error %.4g V", step.effect, step.held_out_rmse_with_v)
-            chosen.append(number)
-        return replace(self._selected(chosen), steps=tuple(steps))
+            chosen.append(item)
+        return Selected(tuple(chosen), tuple(steps))
 
-    def _selected(self, chosen: Sequence[int]) -> Selected:
-        return Selected(tuple(self._offered[number] for number in chosen))
-
-    def _of(self, chosen: Sequence[int]) -> tuple[list[LogSums], PackPrior, FloatArray]:
+    def _of(self, chosen: Sequence[EffectCandidate]) -> tuple[list[LogSums], PackPrior, FloatArray]:
         """Return the arguments of `solve` for some candidates."""
-        columns = [place for number in chosen for place in self._places[number]]
-        sums = [item.with_columns(columns) for item in self._sums]
-        return sums, self._pack, self._selected(chosen).amplitude_std
+        columns = [column for item in chosen for column in self._columns[item].tolist()]
+        sums = [of_log.with_columns(columns) for of_log in self._sums]
+        return sums, self._pack, Selected(tuple(chosen)).amplitude_std
 
-    def _left_out(self, chosen: Sequence[int]) -> FloatArray:
+    def _left_out(self, chosen: Sequence[EffectCandidate]) -> FloatArray:
         """Return the mean square error of each left-out log [V²]; of the fit for too few logs."""
         sums, pack, std = self._of(chosen)
         without = solve_without(sums, pack, std) or [solve(sums, pack, std)] * len(sums)
         return np.array(
-            [other.square_error(item) for item, other in zip(sums, without, strict=True)]
+            [other.square_error(of_log) for of_log, other in zip(sums, without, strict=True)]
         )
 
     def _compared(
-        self, chosen: list[int], before: FloatArray
-    ) -> list[tuple[int, SearchStep, FloatArray]]:
+        self, chosen: Sequence[EffectCandidate], before: FloatArray
+    ) -> list[tuple[EffectCandidate, SearchStep, FloatArray]]:
         """Return the best candidates, the largest gain on left-out logs first."""
-        taken = {self._offered[number].effect.id for number in chosen}
-        fits: list[tuple[float, int]] = []
-        for number, item in enumerate(self._offered):
-            if item.effect.id in taken or item in self.refused:
-                continue
-            solution = solve(*self._of([*chosen, number]))
-            if not self._selected([*chosen, number]).at_bound(solution):
-                fits.append((solution.residual_v, number))
+        taken = {item.effect.id for item in chosen}
+        fits = []
+        for item in self._columns:
+            if item.effect.id not in taken and item not in self.refused:
+                solution = solve(*self._of([*chosen, item]))
+                if not Selected((*chosen, item)).at_bound(solution):
+                    fits.append((solution.residual_v, item))
         found = []
-        for _, number in sorted(fits)[:COMPARED]:
-            after = self._left_out([*chosen, number])
+        for _, item in sorted(fits, key=itemgetter(0))[:COMPARED]:
+            after = self._left_out([*chosen, item])
             gain = np.log(before / after)
             spread = float(gain.std(ddof=1)) / gain.size**0.5 if gain.size > 1 else float("inf")
             step = SearchStep(
                 "not added",
-                self._offered[number].effect.id,
+                item.effect.id,
                 float(before.mean()) ** 0.5,
                 float(after.mean()) ** 0.5,
                 float(gain.mean()),
                 float(gain.mean()) / max(spread, 1e-12),
                 self._t_needed,
             )
-            found.append((number, step, after))
+            found.append((item, step, after))
         return sorted(found, key=_gain, reverse=True)
 
 
-def _gain(compared: tuple[int, SearchStep, FloatArray]) -> float:
+def _gain(compared: tuple[EffectCandidate, SearchStep, FloatArray]) -> float:
     return compared[1].gain
