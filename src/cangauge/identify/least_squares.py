@@ -232,8 +232,7 @@ def solve(
     theta0 = np.r_[prior.coefficients, np.zeros(amplitude_std.size)]
     Lambda = np.diag(np.r_[1.0 / np.diag(prior.covariance), amplitude_std**-2.0])
     Lambda[:N, :N] = np.linalg.inv(prior.covariance[:N, :N])
-    colder = np.maximum(1.0, resistance_factor(np.array([item.mean_c for item in sums])))
-    level_std = pack.chemistry.level_std * mean_v * colder**pack.chemistry.cold_exponent
+    level_std = pack.chemistry.level_v(mean_v, [item.mean_c for item in sums])
     ohm = prior.arrhenius_ohm
     for _ in range(2):  # the column of b needs the resistances: twice
         arrhenius_ohm = ohm
@@ -306,8 +305,7 @@ def left_out_scale(
         if item.weight < SECONDS_PER_DATUM:
             continue
         error, variance = other.mean_error(item)
-        colder = max(1.0, float(resistance_factor(item.mean_c))) ** chemistry.cold_exponent
-        level2 = (chemistry.level_std * other.mean_v * colder) ** 2
+        level2 = float(chemistry.level_v(other.mean_v, item.mean_c)) ** 2
         fast2 = other.residual_v**2 + (ADDED_STD * other.mean_v) ** 2
         fast2 *= SECONDS_PER_DATUM / item.weight
         squares.append(error**2 / (variance + level2 + fast2))

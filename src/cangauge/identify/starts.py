@@ -189,7 +189,7 @@ class _Unknown:
         curve = HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N])
         loads = load_features(rows.dequantized_c, rows.currents_a) @ solution.select[N:, N:].T
         open_v = rows.voltage_v - loads @ solution.coefficients[N:]
-        level2 = (chemistry.level_std * solution.mean_v) ** 2
+        level2 = float(chemistry.level_v(solution.mean_v)) ** 2
 
         def misfit(start_pct: float) -> float:
             soc_pct = self.soc_pct(start_pct)
@@ -205,7 +205,7 @@ class _Unknown:
         """Return an estimated start [%]; raise InputError if a solution does not determine it."""
         sums = self.sums(soc_pct, pack)
         variance = float(solution.mean_error(sums)[1])
-        variance += (pack.chemistry.level_std * solution.mean_v) ** 2
+        variance += float(pack.chemistry.level_v(solution.mean_v)) ** 2
         curve = HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N])
         slope = max(curve.at(sums.mean_soc_pct)[1], SLOPE_AT_LEAST * solution.mean_v)
         std_pct = float(variance**0.5) / slope

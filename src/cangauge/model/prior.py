@@ -23,6 +23,7 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cangauge._typing import FloatArray
 from cangauge.model.voltage_model import (
@@ -34,6 +35,7 @@ from cangauge.model.voltage_model import (
     Loads,
     PublishedCurve,
     hermite_basis,
+    resistance_factor,
 )
 
 ChemistryName = Literal["oxide", "lfp"]
@@ -128,6 +130,11 @@ class Chemistry:
     fast_factor: float
     functions: int
     cold_exponent: float
+
+    def level_v(self, mean_v: float, mean_c: ArrayLike = REFERENCE_C) -> FloatArray:
+        """Return the voltage error that lasts a log, of mean voltage and temperature [V]."""
+        colder = np.maximum(1.0, resistance_factor(mean_c))
+        return np.asarray(self.level_std * mean_v * colder**self.cold_exponent)
 
 
 def _curve(table: Mapping[float, float]) -> FloatArray:
