@@ -94,7 +94,7 @@ def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("answer", "shown"),
-    [("estimate", "soc_mae_pct"), ("gap", "answer.level"), ("judge", "now.verdict")],
+    [("estimate", "SoC MAE [%]"), ("gap", "P(none)"), ("judge", "verdict")],
 )
 def test_what_a_command_refuses_is_a_row_with_its_error(
     folder: Path, answer: str, shown: str
@@ -126,3 +126,13 @@ def test_references_belong_to_gap(folder: Path) -> None:
         "fleet", "judge", log, "-m", model, "-o", folder / "x.parquet", "--reference", log
     )
     refused(ended, "--reference", "judge")
+
+
+def test_the_printed_table_has_words_and_whole_headings(folder: Path) -> None:
+    arguments = ("-m", folder / "type.json", "-o", folder / "shown.parquet", "--reference")
+    references = (drives(folder)[0], "--reference", drives(folder)[1])
+    ended = in_process("fleet", "gap", drives(folder)[2], *arguments, *references)
+    assert ended.code == 0, ended.err
+    for heading in ("answer", "fault", "P(none)", "check first"):
+        assert heading in ended.out
+    assert not {"…", "[", "_"} & set(ended.out)

@@ -227,3 +227,12 @@ def test_recorded_trips(shared_data: Path) -> None:
         assert not found.channels["current_a"].stuck
         json.dumps(plain(found.to_dict()), allow_nan=False)
     assert np.median(capacities) == pytest.approx(61.75, abs=0.1)  # as its README says
+
+
+def test_the_answer_says_what_a_short_log_lacks() -> None:
+    short = drive(0.1)
+    assert inspect_log(short).answer == (
+        "good for an estimate, not for a fit: it needs 52 rows, 1 s apart, beyond the first 70 s"
+        " and the 70 s after each gap; there are none"
+    )
+    assert inspect_log(short.rows(slice(0, 1))).answer.startswith("too short: a single row")

@@ -43,11 +43,15 @@ THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables of the linear algebra, set to 1 where the user has not set them."""
 
 
+def _order(command: EntryPoint) -> tuple[int, str]:
+    return (*FIRST, command.name).index(command.name), command.name
+
+
 COMMANDS: Final = {
     command.name: command
     for command in sorted(
         entry_points(group="cangauge.commands"),
-        key=lambda each: ((*FIRST, each.name).index(each.name), each.name),
+        key=_order,
     )
 }
 """The installed commands by name."""

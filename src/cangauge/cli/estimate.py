@@ -212,14 +212,18 @@ def _of_log(
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
     cells = reading.cells_of(log)
     history = PackHistory(keeps_rows=keeps_pack, cells=cells, duration_s=log.duration_s)
-    with progress() as show:
+    with progress() as show_line:
+
+        def show(count: int) -> None:
+            show_line(f"{log.name}: {count} of {len(log)} samples")
+
         done = estimate_recorded_log(
             log,
             model,
             settings,
             soc_from_log=soc_from_log,
             pack=history,
-            progress=lambda count: show(f"{log.name}: {count} of {len(log)} samples"),
+            progress=show,
         )
     if (gap_s := done.settings.gap_s) >= USUAL_STEPS * GAP_S:  # else the usual step is no gap
         remark(
@@ -243,14 +247,18 @@ def _of_capture(
     from cangauge.service.offline import estimate_capture
 
     car = reading.car_of(path)
-    with progress() as show:
+    with progress() as show_line:
+
+        def show(count: int) -> None:
+            show_line(f"{path.name}: {count} frames")
+
         done = estimate_capture(
             path,
             car,
             model,
             settings,
             keeps_pack=keeps_pack,
-            progress=lambda count: show(f"{path.name}: {count} frames"),
+            progress=show,
         )
     recorded = done.recorded
     refuse_single_row(recorded)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import shlex
 from datetime import UTC, datetime
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import duration, rounded
+from cangauge._text import counted, duration, rounded
 from cangauge.cli.options import (
     JSON,
     REPORT,
@@ -106,13 +107,13 @@ def _show_log(found: LogInspection) -> None:
     from cangauge.inspect.log import ability_rows, channel_rows
 
     timing, charge, soc = found.timing, found.charge, found.soc
-    rate = "one row"
+    rate = "no rate"
     if timing.rate_hz:
         exact = f"{timing.rate_hz:.4g} Hz (regular)"
         rate = exact if timing.regular else f"about {rounded(timing.rate_hz, 2)} Hz (irregular)"
     say(f"{found.name}: {found.answer}.")
     say(
-        f"{found.rows} rows, {duration(timing.duration_s)}, {rate},"
+        f"{counted(found.rows, 'row')}, {duration(timing.duration_s)}, {rate},"
         f" temperature of: {found.temperature_source}"
     )
     print_table("Channels", *channel_rows(found))
@@ -154,7 +155,7 @@ def _show_capture(found: CaptureInspection) -> None:
     if shown := ", ".join(f"{count:,} {words}" for words, count in counts.items() if count):
         say(f"{shown[0].upper()}{shown[1:]}.")
     if found.gaps:
-        gap = max(found.gaps, key=lambda gap: gap.length_s)
+        gap = max(found.gaps, key=attrgetter("length_s"))
         others = f", the longest of {len(found.gaps)}" if len(found.gaps) > 1 else ""
         say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s{others}.")
     for line in info.remarks if found.log is None else ():  # the log's hold them

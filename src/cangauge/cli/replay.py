@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cangauge._text import duration, number
@@ -30,8 +32,15 @@ if TYPE_CHECKING:
 
 
 @command(
-    keys=lambda: config_parameters(
-        "interface", "channel", "bus_options", "vehicle", "dbc", "map", "temperature"
+    keys=partial(
+        config_parameters,
+        "interface",
+        "channel",
+        "bus_options",
+        "vehicle",
+        "dbc",
+        "map",
+        "temperature",
     )
 )
 def replay_command(
@@ -96,24 +105,26 @@ def replay_command(
     loaded = load_config(config, {"model": "-", **config_values(options)})
     ids = loaded.ids
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
-    stopped: list[bool] = []
+    stopped = Event()
     factor = math.inf if speed == "max" else speed
     settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
     with ExitStack() as stack:
-        stack.enter_context(stop_on_signals(lambda: stopped.append(True)))
+        stack.enter_context(stop_on_signals(stopped.set))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
-        show = stack.enter_context(progress())
-        state = play(
-            bus, source, settings, stop=lambda: bool(stopped), show=lambda now: show(_line(now))
-        )
+        show_line = stack.enter_context(progress())
+
+        def show(state: ReplayState) -> None:
+            show_line(_line(state))
+
+        state = play(bus, source, settings, stop=stopped.is_set, show=show)
     note(_line(state))
     if bus.unsent:
         note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")
     if json_output:
         emit_json(_as_json(state, bus, source))
-    if stopped and not loop:
+    if stopped.is_set() and not loop:
         raise KeyboardInterrupt
 
 

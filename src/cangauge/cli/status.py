@@ -84,7 +84,7 @@ def status_command(
             emit_json({"running": False, "status": None, "problem": str(error)})
             raise typer.Exit(1) from error
         raise CangaugeError(str(error)) from error
-    finish(status, lambda: print_values(title, status_values(status)), as_json=json_output)
+    finish(status, partial(print_values, title, status_values(status)), as_json=json_output)
     if status["status"] not in {"valid", "degraded"}:
         raise typer.Exit(1)
 

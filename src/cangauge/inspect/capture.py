@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import islice
+from operator import attrgetter
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -131,7 +133,7 @@ def inspect_capture(
     ids: defaultdict[tuple[str, int, bool], _Frames] = defaultdict(_Frames)
     cars = {name: preset.vehicle() for name, preset in PRESETS.items()}
     wanted = {key for car in cars.values() for key in car.wanted_ids}
-    buses = defaultdict[str, list[_Trial]](lambda: [_Trial(*each) for each in cars.items()])
+    buses = defaultdict[str, list[_Trial]](partial(_trials, cars))
     for message in islice(capture, frames):
         stamps_s.append(message.timestamp)
         error_frames += message.is_error_frame
@@ -186,11 +188,15 @@ def _rules_of(vehicle: Vehicle) -> dict[tuple[int, bool], _Rule]:
     }
 
 
+def _no_stamps() -> array[float]:
+    return array("d")
+
+
 @dataclass(slots=True)
 class _Frames:
     """Frames of one id on one bus; `payloads` are joined, for as long as all have one length."""
 
-    stamps_s: array[float] = field(default_factory=lambda: array("d"))
+    stamps_s: array[float] = field(default_factory=_no_stamps)
     lengths: set[int] = field(default_factory=set)
     payloads: bytearray = field(default_factory=bytearray)
 
@@ -318,11 +324,15 @@ class _Trial:
         return "" if has_temperature or duration_s < LONG_ENOUGH_S else "no temperature"
 
 
+def _trials(cars: Mapping[str, Vehicle]) -> list[_Trial]:
+    return [_Trial(*each) for each in cars.items()]
+
+
 def _wrong_period(preset: str, ids: Sequence[IdSummary], duration_s: float) -> str:
     """Return which id is absent or has another period, on the bus that has most of it, or ""."""
     for number, expected_s in PRESETS[preset].periods_s.items():
         same = [each for each in ids if each.id == f"{number:03X}"]
-        period_s = max(same, key=lambda each: each.frames).period_s if same else None
+        period_s = max(same, key=attrgetter("frames")).period_s if same else None
         if period_s is None and duration_s >= LONG_ENOUGH_S:
             return f"no frames of 0x{number:X}"
         if period_s is not None and abs(period_s - expected_s) > PERIOD_TOLERANCE * expected_s:

@@ -50,6 +50,7 @@ REST_S: Final = 300.0
 """Shortest rest that shows the rest voltage [s]."""
 WIDE_SOC_PCT: Final = 60.0
 """Span of SoC that shows most of the voltage curve [%]."""
+SINGLE_ROW: Final = "too short: a single row, and charge is counted from one row to the next"
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +157,9 @@ class LogInspection:
     @property
     def answer(self) -> str:
         """What the log is good for, or what stands against it."""
-        if self.contradiction is not None:
-            return self.contradiction
+        problem = SINGLE_ROW if self.rows == 1 else self.contradiction
+        if problem is not None:
+            return problem
         if self.sign.sign < 0:
             return f"{self.sign.sentence}; --sign charge inverts it"
         assessed = {item.topic: item for item in self.abilities}
@@ -405,10 +407,13 @@ def _rows(log: Log, timing: Timing) -> tuple[Verdict, str]:
     kept, removed = usable_rows(log, delay_s, FIT_RATE_HZ)
     total = kept.size + removed["start_up_or_shut_down"] + removed["delay_line_filling"]
     step_s = max(timing.interval_median_s or 0.0, 1.0 / FIT_RATE_HZ)
+    if kept.size < LEAST_ROWS:
+        delay = f"{max(delay_s):.0f} s"
+        needed = f"it needs {LEAST_ROWS} rows, {step_s:.3g} s apart, beyond the first {delay}"
+        return "no", f"{needed} and the {delay} after each gap; there are {kept.size or 'none'}"
     text = f"{kept.size} of {total} rows every {step_s:.3g} s; the first {max(delay_s):.0f} s, and"
-    text += f" as long after each gap, fill the delay line; {LEAST_ROWS} are needed"
-    verdict: Verdict = "yes" if kept.size > 0.5 * total else "partly"
-    return verdict if kept.size >= LEAST_ROWS else "no", text
+    text += " as long after each gap, fill the delay line"
+    return "yes" if kept.size > 0.5 * total else "partly", text
 
 
 def _temperature(log: Log) -> tuple[Verdict, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Final
 
 import can
@@ -62,7 +63,7 @@ class FrameEncoder:
                 cure = "replay as another --vehicle"
                 raise InputError(problem, source=source, field=where, cure=cure)
             self._frames.append(_Outgoing(signals, is_slow))
-        self._frames.sort(key=lambda frame: not frame.is_slow)
+        self._frames.sort(key=attrgetter("is_slow"), reverse=True)
 
     def encode(self, sample: Sample, soc_reference_pct: float = math.nan) -> list[can.Message]:
         """Return the frames of one sample, in sending order.

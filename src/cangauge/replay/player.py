@@ -101,13 +101,17 @@ class ReplayState:
         return self.log_seconds / self.seconds if self.seconds > 0.0 else None
 
 
+def _show_nothing(_state: ReplayState) -> None:
+    """Show nothing."""
+
+
 def play(
     bus: BusConnection,
     source: Source,
     settings: ReplaySettings,
     *,
     stop: Callable[[], bool],
-    show: Callable[[ReplayState], None] = lambda _: None,
+    show: Callable[[ReplayState], None] = _show_nothing,
 ) -> ReplayState:
     """Play a source on a bus.
 
@@ -140,7 +144,7 @@ def play(
                 value="max",
                 cure="give --vehicle or --map, or another speed",
             )
-        player.wait_until(lambda: player.is_ready)
+        player.wait_until(player.is_ready)
     show_s = -math.inf
     for step in source.steps(loop=settings.loop):
         if stop():
@@ -151,7 +155,7 @@ def play(
             show(player.update(LISTEN_S))
     player.send_count()
     if player.is_max:
-        player.wait_until(lambda: not player.in_flight)
+        player.wait_until(player.is_acknowledged)
     show(player.update(LISTEN_AT_END_S))
     return player.state
 
@@ -213,7 +217,7 @@ class _Player:
             self._pacer.wait(step.time_us)
         elif self._frames_in_flight >= WINDOW_FRAMES:
             # Drain to half, so that both sides work in batches.
-            self.wait_until(lambda: self._frames_in_flight <= WINDOW_FRAMES // 2)
+            self.wait_until(self._has_room)
         if self._first_us is None:
             self._first_us, self._began_s = step.time_us, time.monotonic()
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
@@ -262,10 +266,16 @@ class _Player:
                 " acknowledges frames?"
             )
 
-    @property
     def is_ready(self) -> bool:
-        """Whether a SOC_DETAIL has come, from which samples are counted."""
+        """Return whether a SOC_DETAIL has come, from which samples are counted."""
         return self._count is not None
+
+    def is_acknowledged(self) -> bool:
+        """Return whether no sample is in flight."""
+        return not self.in_flight
+
+    def _has_room(self) -> bool:
+        return self._frames_in_flight <= WINDOW_FRAMES // 2
 
     @property
     def _frames_in_flight(self) -> int:
@@ -289,7 +299,7 @@ class _Player:
                 emit(_LOG, logging.WARNING, "replay.lost", text)
             elif now_s - last_s > self._within_s:
                 problem = "no receiver: no SOC_DETAIL"
-                if self.is_ready:
+                if self.is_ready():
                     problem = f"{state.acknowledged} of {state.samples} samples sent have been"
                     problem += " processed: no acknowledgement"
                 raise self._error(f"{problem} in {self._within_s:g} s; {_HINT}")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from cangauge._text import number
+from cangauge._text import NONE_KNOWN, number
 from cangauge.cli.options import (
     JSON,
     MODEL,
@@ -27,11 +29,25 @@ if TYPE_CHECKING:
     from cangauge.extras.fleet.rows import Row
 
 _SHOWN: Final = {
-    "estimate": ("soc_mae_pct", "voltage_mae_pct", "valid_fraction"),
-    "gap": ("answer.level", "answer.stated", "answer.probability_none", "answer.check_first"),
-    "judge": ("now.verdict", "now.error_pct", "now.sigma_pct", "next_step"),
+    "estimate": {
+        "SoC MAE [%]": "soc_mae_pct",
+        "voltage MAE [%]": "voltage_mae_pct",
+        "valid part": "valid_fraction",
+    },
+    "gap": {
+        "answer": "answer.level",
+        "fault": "answer.stated",
+        "P(none)": "answer.probability_none",
+        "check first": "answer.check_first",
+    },
+    "judge": {
+        "verdict": "now.verdict",
+        "error [%]": "now.error_pct",
+        "± [%]": "now.sigma_pct",
+        "next step": "next_step",
+    },
 }
-"""Columns that are printed; the table has all."""
+"""Headings and columns that are printed; the table has all."""
 _SHOWN_ROWS: Final = 20
 """Logs and reasons that are printed; the table has all."""
 
@@ -98,7 +114,7 @@ def fleet_command(
         for row in run(job, logs, scheduler):
             rows.append(row)
             show(f"{len(rows)} of {len(logs)} logs")
-    rows.sort(key=lambda row: str(row["log"]))
+    rows.sort(key=itemgetter("log"))
     write_rows(rows, output)
     bad = [row for row in rows if row["error"] is not None]
     result = {"logs": len(rows), "failed": len(bad)}
@@ -112,14 +128,23 @@ def _show(answer: str, rows: Sequence[Row], bad: Sequence[Row]) -> None:
     """Print how many logs have an answer, the first ones, and why the others failed."""
     say(f"{len(rows) - len(bad)} of {len(rows)} logs have an answer.")
     good = [row for row in rows if row["error"] is None][:_SHOWN_ROWS]
-    names = [name for name in _SHOWN[answer] if any(row.get(name) is not None for row in good)]
     if good:
-        cells = [[Path(row["log"]).name, *(_cell(row.get(name)) for name in names)] for row in good]
-        print_table(answer, ["log", *names], cells)
+        shown = _SHOWN[answer]
+        cells = [
+            [Path(row["log"]).name, *(_cell(row.get(name)) for name in shown.values())]
+            for row in good
+        ]
+        print_table(answer, ["log", *shown], cells)
     reasons = Counter(row["error"].removeprefix(f"{row['log']}: ") for row in bad)
     for reason, count in reasons.most_common(_SHOWN_ROWS):
         note(f"failed: {count} × {reason}")
 
 
 def _cell(value: Any) -> str:
-    return number(value, 2) if isinstance(value, int | float) else str(value or "")
+    """Return a value as text; a list is one of names in JSON."""
+    if value is None:
+        return NONE_KNOWN
+    if isinstance(value, int | float):
+        return number(value, 2)
+    names = json.loads(value) if value.startswith("[") else [value]
+    return ", ".join(name.replace("_", " ") for name in names) or NONE_KNOWN

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
@@ -65,7 +66,8 @@ class _SheetText(Head):
     def __init__(self, head: Head) -> None:
         self.path, self.name = head.path, head.name
         sheets = _sheets(head)
-        longest, rows = max(sheets.items(), key=lambda sheet: len(sheet[1]), default=("", []))
+        rows = max(sheets.values(), key=len, default=[])
+        longest = next((title for title, each in sheets.items() if each is rows), "")
         others = [
             f"{title!r} ({len(each)} rows)"
             for title, each in sheets.items()
@@ -297,7 +299,7 @@ def _time_of(text: TextTable) -> str:
     """Return the most direct heading of time, "" without any."""
     meanings = [(meaning_of(heading), heading) for heading in text.headings]
     times = [(m.rank, heading) for m, heading in meanings if m and m.quantity == "time"]
-    return min(times, key=lambda item: item[0], default=(0, ""))[1]
+    return min(times, key=itemgetter(0), default=(0, ""))[1]
 
 
 def _text_of(cells: Any) -> Any:

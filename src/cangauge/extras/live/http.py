@@ -85,6 +85,10 @@ class StatusServer(Output):
         self.latest = snapshot
 
 
+def _log_nothing(_handler: RequestHandler) -> None:
+    """Log no request: a client could fill the disk."""
+
+
 def serve(
     server: Output,
     listening: socket.socket,
@@ -98,7 +102,7 @@ def serve(
     context = {"server": server}
     application = Application(
         [(path, page, context) for path, page in pages.items()],
-        log_function=lambda _: None,
+        log_function=_log_nothing,
         websocket_ping_interval=PING_S,
         websocket_max_message_size=MAX_BODY_BYTES,
     )

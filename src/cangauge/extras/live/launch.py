@@ -88,6 +88,10 @@ def offer_of(config: RunConfig) -> Offer:
     return Offer(**addresses, mqtt=mqtt)
 
 
+def _started_by_its_unit(_service: Service) -> Output:
+    return Output()
+
+
 def output_of(config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Output]:
     """Return what starts the child, or nothing where it is a unit; may raise InputError."""
     if os.name != "posix":
@@ -95,7 +99,7 @@ def output_of(config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Outpu
         raise InputError(problem, field="dashboard", cure="run without them")
     offer = offer_of(config)
     if config.live == "unit":
-        return lambda _: Output()
+        return _started_by_its_unit
 
     def start(service: Service) -> Output:
         if service.endpoint is None:

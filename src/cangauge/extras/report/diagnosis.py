@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -113,7 +114,8 @@ def _shrinks(found: Diagnosis) -> Figure:
 
 def _widest(where: Sequence[Mapping[str, Any]]) -> str:
     """Return the axis with the largest excess that is certain."""
-    return str(max(where, key=lambda place: place["ci"][0])["axis"])
+    excesses = [place["ci"][0] for place in where]
+    return str(where[excesses.index(max(excesses))]["axis"])
 
 
 def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
@@ -122,7 +124,7 @@ def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     for axis in dict.fromkeys(place["axis"] for place in where):
         shown = [place for place in where if place["axis"] == axis]
         entries = [(_interval(place), place["rmse_v"], ORANGE) for place in shown]
-        largest = max(shown, key=lambda place: place["excess"])
+        largest = max(shown, key=itemgetter("excess"))
         times = number(largest["excess"], 1)
         caption = f"{times} times the error of all rows at {_interval(largest)}."
         title = f"Where: {_AXES.get(axis, axis)}"

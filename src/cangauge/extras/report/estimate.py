@@ -138,7 +138,8 @@ def _longest_period(table: EstimateTable) -> str:
     ]
     if not periods:
         return ""
-    start_s, end_s, rows = max(periods, key=lambda period: period[1] - period[0])
+    durations = [end_s - start_s for start_s, end_s, _ in periods]
+    start_s, end_s, rows = periods[durations.index(max(durations))]
     name = Status(int(status[rows.start])).name.lower()
     reasons = np.asarray(table.reasons[rows]).astype(np.int64)
     samples = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}

@@ -67,6 +67,14 @@ Block = str | Table | Figure | Sequence[str] | Sequence[Figure]
 """A paragraph, a table, a figure, a list of remarks, or figures side by side."""
 
 
+def _is_figure(block: Block) -> bool:
+    return isinstance(block, Figure)
+
+
+def _is_table(block: Block) -> bool:
+    return isinstance(block, Table)
+
+
 @dataclass(frozen=True, eq=False)
 class Page:
     """A whole report.
@@ -127,8 +135,7 @@ class Page:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        environment.tests["figure"] = lambda block: isinstance(block, Figure)
-        environment.tests["table"] = lambda block: isinstance(block, Table)
+        environment.tests |= {"figure": _is_figure, "table": _is_table}
         texts = [text for log in self.logs for text in (log.name, log.source, *log.remarks)]
         is_reconstruction = any("reconstruction" in text.lower() for text in texts)
         parts = [
