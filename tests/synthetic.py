@@ -12,7 +12,7 @@ from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
-from cangauge.model.voltage_model import Curve, Loads, Ranges, VoltageModel
+from cangauge.model.voltage_model import DELAYS_S, Curve, Loads, Ranges, VoltageModel
 
 
 def drive_current(time_s: np.ndarray, mean_a: float, seed: int) -> np.ndarray:
@@ -69,9 +69,9 @@ def voltage_model(
 ) -> VoltageModel:
     """A voltage model of a curve and loads, for all SoC."""
     known = RANGES.model_copy(update={"temperature_c": temperature_c})
-    return VoltageModel(
-        curve, Loads(kt_v_per_k=kt_v_per_k, resistance_ohm=resistance_ohm, **loads), known
-    )
+    usual = {"t_ref_c": 20.0, "delays_s": DELAYS_S, "low_pass_s": (), "arrhenius": None}
+    given = {"kt_v_per_k": kt_v_per_k, "resistance_ohm": resistance_ohm, **loads}
+    return VoltageModel(curve, Loads(**(usual | given)), known)
 
 
 def within_c(model: VoltageModel, low_c: float, high_c: float) -> VoltageModel:

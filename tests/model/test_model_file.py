@@ -116,6 +116,10 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
         (lambda raw: raw["curve"]["voltage_v"].insert(3, "many"), "curve.voltage_v.3"),
         (lambda raw: raw["curve"].update(voltage_v=[3.7e4] * 28), "curve.voltage_v"),
         (lambda raw: raw["loads"].update(delays_s=[0.0, 30.0, 10.0, 70.0]), "loads.delays_s"),
+        *(
+            (lambda raw, name=name: raw["loads"].pop(name), f"loads.{name}")
+            for name in ("t_ref_c", "delays_s", "low_pass_s", "arrhenius")
+        ),
         (lambda raw: raw["loads"]["resistance_ohm"].pop(), "loads.resistance_ohm"),
         (lambda raw: raw["loads"].update(resistance_ohm=[9.0] * 6), "loads.resistance_ohm.0"),
         (lambda raw: raw["loads"]["arrhenius"].update(factor=1e300), "loads.arrhenius.factor"),

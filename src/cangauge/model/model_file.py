@@ -45,7 +45,9 @@ from cangauge.model.prior import (
 )
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
+    DELAYS_S,
     KNOTS_PCT,
+    REFERENCE_C,
     Arrhenius,
     Functions,
     HermiteCurve,
@@ -121,7 +123,9 @@ class Published(Fields):
             t_ref_c=self.t_ref_c,
             kt_v_per_k=kt,
             delays_s=self.delays_s,
+            low_pass_s=(),
             resistance_ohm=tuple(ohm),
+            arrhenius=None,
         )
 
     @model_validator(mode="after")
@@ -423,7 +427,9 @@ class Model(Fields):
         chemistry: ChemistryName = fields["chemistry"]
         kt, *ohm, b = known.coefficients[n:p].tolist()
         loads = Loads(
+            t_ref_c=REFERENCE_C,
             kt_v_per_k=kt,
+            delays_s=DELAYS_S,
             low_pass_s=LOW_PASS_S,
             resistance_ohm=tuple(ohm),
             arrhenius=Arrhenius(b, tuple(known.arrhenius_ohm.tolist()), known.mean_c),

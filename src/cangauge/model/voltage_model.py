@@ -420,17 +420,17 @@ class Arrhenius:
 class Loads(Fields):
     """Temperature coefficient and resistances of a voltage model, as its file states them."""
 
-    t_ref_c: Celsius = REFERENCE_C
+    t_ref_c: Celsius
     """Reference temperature T_r [°C]."""
     kt_v_per_k: Value
     """Temperature coefficient [V/K]."""
-    delays_s: Delays = DELAYS_S
+    delays_s: Delays
     """Delays of the current [s]."""
-    low_pass_s: tuple[Seconds, ...] = ()
+    low_pass_s: tuple[Seconds, ...]
     """Time constants of the low-passed currents [s]."""
     resistance_ohm: tuple[Value, ...]
     """Rm on the current at each delay, then on each low-passed current [Ω]; negative."""
-    arrhenius: Arrhenius | None = None
+    arrhenius: Arrhenius | None
     """None for constant resistances."""
 
     @model_validator(mode="after")
