@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
+
+import numpy as np
 
 from cangauge.errors import InputError
 
@@ -33,6 +36,16 @@ class ArrowExport:
     def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
         """Export the columns through the Arrow PyCapsule interface."""
         return self.to_arrow().__arrow_c_stream__(requested_schema)
+
+
+def arrow_table(columns: Mapping[str, Any], metadata: Mapping[bytes, str] | None = None) -> Any:
+    """Return a pyarrow.Table of arrays; NaN becomes null."""
+    pa = import_module("pyarrow")
+    arrays = {
+        name: pa.array(values, from_pandas=True) if isinstance(values, np.ndarray) else values
+        for name, values in columns.items()
+    }
+    return pa.table(arrays, metadata=metadata)
 
 
 def _import(package: str) -> Any:

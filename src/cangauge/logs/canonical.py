@@ -11,21 +11,18 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
+from cangauge._dataframes import arrow_table
 from cangauge._files import Head, atomic_path
 from cangauge.errors import InputError
-from cangauge.logs.log import Log
-from cangauge.logs.table import SOURCE, ArrowTable
+from cangauge.logs.log import SOURCE, SOURCE_KEY, Log
+from cangauge.logs.table import ArrowTable
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
-from cangauge.settings import TemperatureSource
-
-_METADATA_KEY: Final = b"cangauge.temperature_source"
 
 
 def parquet_table(head: Head) -> ArrowTable:
@@ -49,7 +46,7 @@ def parquet_table(head: Head) -> ArrowTable:
             if count > limit:
                 problem = f"more than the {limit} {what} that a log may have"
                 raise InputError(problem, source=head.path, value=count, cure="split it")
-        return arrow_table(file.schema_arrow, read, str(head.path))
+        return table_of_schema(file.schema_arrow, read, str(head.path))
 
 
 @contextmanager
@@ -64,23 +61,11 @@ def _opened(head: Head) -> Iterator[Any]:
             raise InputError(problem, source=head.path, cure="export again") from error
 
 
-def arrow_table(schema: Any, read: Any, source: str) -> ArrowTable:
+def table_of_schema(schema: Any, read: Any, source: str) -> ArrowTable:
     """Return a table of an Arrow schema with the temperature source of its metadata."""
     metadata: dict[bytes, bytes] = schema.metadata or {}
-    word = metadata.get(_METADATA_KEY, b"").decode("utf-8", errors="replace")
+    word = metadata.get(SOURCE_KEY, b"").decode("utf-8", errors="replace")
     return ArrowTable(schema.names, read, word, source)
-
-
-def build_table(
-    columns: Mapping[str, Any], temperature_source: TemperatureSource = "unknown"
-) -> Any:
-    """Return a pyarrow.Table; NaN becomes null, a known temperature source becomes metadata."""
-    arrays = {
-        name: pa.array(values, from_pandas=True) if isinstance(values, np.ndarray) else values
-        for name, values in columns.items()
-    }
-    metadata = {_METADATA_KEY: temperature_source} if temperature_source != "unknown" else None
-    return pa.table(arrays, metadata=metadata)
 
 
 def write_log(log: Log, path: str | PathLike[str]) -> None:
@@ -99,7 +84,7 @@ def write_log(log: Log, path: str | PathLike[str]) -> None:
 
 def write_table(columns: Mapping[str, Any] | pa.Table, path: str | PathLike[str]) -> None:
     """Write a table or arrays as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
-    table = columns if isinstance(columns, pa.Table) else build_table(columns)
+    table = columns if isinstance(columns, pa.Table) else arrow_table(columns)
     suffix = Path(path).suffix.lower()
     suffix = ".bdf" if ".bdf" in Path(Path(path).name.lower()).suffixes else suffix
     if suffix not in {".parquet", ".pq", ".csv"}:

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from os import PathLike
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cangauge._dataframes import ArrowExport
+from cangauge._dataframes import ArrowExport, arrow_table
 from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
-from cangauge.errors import InputError, naming_arguments, require_temperature
+from cangauge.errors import InputError, naming_arguments
 from cangauge.logs.quantities import REQUIRED
 from cangauge.settings import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.types import SOC_WITHIN_PCT
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
+
+SOURCE: Final = "temperature_source"
+"""Column of a canonical log: the location of the temperature sensor."""
+SOURCE_KEY: Final = b"cangauge.temperature_source"
+"""Metadata of an Arrow schema with the same word."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -152,21 +158,24 @@ class Log(ArrowExport):
         >>> Log.from_dataframe(table, temperature_c=21.0).voltage_v
         array([380., 379.])
         """
-        # Deferred: the service runs where pyarrow is not installed.
-        from cangauge.logs.read import draft_of_dataframe  # noqa: PLC0415
-
-        require_temperature(temperature_c)
-        draft = draft_of_dataframe(table, name, columns)
-        return draft.log(temperature_c, temperature_source, sign)
+        log: Log = _reading().log_of_dataframe(
+            table,
+            name=name,
+            columns=columns,
+            temperature_c=temperature_c,
+            temperature_source=temperature_source,
+            sign=sign,
+        )
+        return log
 
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; missing SoC is null.
 
         The temperature source, where known, is metadata of the schema.
         """
-        from cangauge.logs.canonical import build_table  # noqa: PLC0415 - pyarrow, as above
-
-        return build_table(self._channels(), self.temperature_source)
+        is_known = self.temperature_source != "unknown"
+        metadata = {SOURCE_KEY: self.temperature_source} if is_known else None
+        return arrow_table(self._channels(), metadata)
 
     def __repr__(self) -> str:
         """Return one line of what the log holds."""
@@ -223,10 +232,14 @@ def as_log(log: Any) -> Log:
     if isinstance(log, Log):
         return log
     if isinstance(log, str | PathLike):
-        from cangauge.logs.read import open_log  # noqa: PLC0415 - pyarrow, as above
-
-        return open_log(log).read()
+        read: Log = _reading().open_log(log).read()
+        return read
     return Log.from_dataframe(log)
+
+
+def _reading() -> Any:
+    """Return the module that reads logs, by name: the service runs without pyarrow."""
+    return import_module("cangauge.logs.read")
 
 
 def _read_only(values: ArrayLike) -> FloatArray:

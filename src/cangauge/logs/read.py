@@ -16,7 +16,7 @@ import pyarrow as pa
 from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, require_temperature
-from cangauge.logs.canonical import arrow_table, parquet_table
+from cangauge.logs.canonical import parquet_table, table_of_schema
 from cangauge.logs.column_map import DOCS, ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog, Sign
@@ -245,10 +245,17 @@ def open_log(
     return LogFile(head, None if given is None else LogTableReader(), given, sign)
 
 
-def draft_of_dataframe(
-    frame: Any, name: str, columns: ColumnMap | Mapping[str, str] | str | None
-) -> DraftLog:
-    """Return the draft of the log in a data frame; see `Log.from_dataframe`."""
+def log_of_dataframe(
+    frame: Any,
+    *,
+    name: str,
+    columns: ColumnMap | Mapping[str, str] | str | None,
+    temperature_c: float | None,
+    temperature_source: TemperatureSource | None,
+    sign: Sign | None,
+) -> Log:
+    """Return the log in a data frame; see `Log.from_dataframe`."""
+    require_temperature(temperature_c)
     try:
         table = pa.table(frame)
     except (TypeError, ValueError, pa.ArrowException) as error:
@@ -260,8 +267,9 @@ def draft_of_dataframe(
         table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
-    columns_of = arrow_table(table.schema, table.select, name)
-    return draft_of_table(columns_of, given, name=name, source="")
+    columns_of = table_of_schema(table.schema, table.select, name)
+    draft = draft_of_table(columns_of, given, name=name, source="")
+    return draft.log(temperature_c, temperature_source, sign)
 
 
 def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:

@@ -31,6 +31,7 @@ from cangauge.logs.columns import (
 )
 from cangauge.logs.draft import COUNTER, MAX_INCOMPLETE, DraftLog
 from cangauge.logs.headings import Rank, charge_scale
+from cangauge.logs.log import SOURCE
 from cangauge.logs.quantities import (
     FIELDS,
     QUANTITIES,
@@ -45,8 +46,6 @@ from cangauge.logs.values import first_text, is_number, numbers_of, present, wit
 
 MAX_COUNTERS: Final = 6
 """Most columns in Ah of which one is looked for that counts the charge [-]."""
-SOURCE: Final = "temperature_source"
-"""Column or metadata of a canonical log: the location of the temperature sensor."""
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""

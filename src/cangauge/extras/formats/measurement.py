@@ -11,10 +11,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from cangauge._dataframes import arrow_table
 from cangauge._files import MIB, Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.canonical import build_table
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog
@@ -76,7 +76,7 @@ def _draft_of_channels(
             if name != _TIME:
                 columns[name], note = _on_raster(time_s, found[name], name, is_held=name in held)
                 notes.extend([note] if note else [])
-        return build_table(columns)
+        return arrow_table(columns)
 
     draft = draft_of_table(ArrowTable(names, table), given, name=head.name, source=source)
     draft.remarks.extend(notes)
