@@ -66,6 +66,10 @@ def test_no_current_of_one_sign_wraps(seed: int) -> None:
     assert wrapped_current(constant, 3.6 - 0.002 * constant) is None
 
 
+def test_three_rows_prove_no_wrap() -> None:
+    assert wrapped_current(np.array([980.0, 802.0, 1959.0]), np.array([1.0, 2.0, 2.0])) is None
+
+
 @pytest.mark.parametrize("wraps_at_a", [32.768, 65.536, 655.36])
 def test_a_load_that_only_comes_near_a_fields_end_does_not_wrap(wraps_at_a: float) -> None:
     current = np.random.default_rng(4).uniform(0.55 * wraps_at_a, 0.99 * wraps_at_a, ROWS)

@@ -7,6 +7,7 @@ from itertools import product
 from typing import Final
 
 import numpy as np
+from scipy import special
 
 from cangauge._typing import FloatArray
 
@@ -26,6 +27,9 @@ _FIELDS: Final = tuple(
     product((16, 15, 32, 14, 13, 12, 11, 10), (0.1, 0.01, 0.001, 1.0, 0.05, 0.5, 0.02, 0.025, 0.25))
 )
 """Width [bit] and step [A] of a current's field on a bus, the usual ones first."""
+_BY_CHANCE: Final = 1e-4
+"""Probability below which the voltage does not follow the steps of a current by chance [-]: tables
+are many, and few of them wrap."""
 _USUAL_BITS: Final = (16, 15, 32)
 """Widths by which readings that never come near zero are those of a field [bit]."""
 
@@ -83,7 +87,10 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
     if passes_zero:
         unwrapped = np.where(is_high, readings - wraps_at_a, readings)
         moved_v = np.diff(voltage_v)
-        is_wrapped = _explained(np.diff(unwrapped), moved_v) > _explained(steps, moved_v)
+        share = _explained(np.diff(unwrapped), moved_v)
+        # Of the share that as many random steps explain (Student's t, as a beta distribution).
+        by_chance = float(special.betainc(0.5 * max(steps.size - 1, 1), 0.5, 1.0 - share))
+        is_wrapped = by_chance < _BY_CHANCE and share > _explained(steps, moved_v)
     else:
         is_wrapped = shows_step and bits in _USUAL_BITS
     reading_a = -largest if is_negative else largest
