@@ -16,6 +16,7 @@ from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge.cli.options import (
     ALARM,
+    CAPACITY_AH,
     JSON,
     REPORT,
     ReadingOptions,
@@ -62,16 +63,7 @@ def gap_command(
             unit="%",
         ),
     ] = None,
-    capacity_ah: Annotated[
-        float | None,
-        option(
-            "--capacity-ah",
-            "A",
-            "Charge from 100 to 0 %, in place of the model's, for all logs.",
-            within=(0.001, 1e5),
-            unit="Ah",
-        ),
-    ] = None,
+    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
     extended: Annotated[
         Path | None,
         option(

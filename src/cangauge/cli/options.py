@@ -108,12 +108,16 @@ def _number(text: str, field: str, words: Sequence[str], unit: str) -> float:
 
 
 MODEL: Final = option("-m, --model", "MODEL", "Model file of `cangauge fit`.")
-CHEMISTRY: Final = option("--chemistry", "oxide|lfp", "Chemistry of the cells.")
-CELLS: Final = option("--cells", "N", "Cells in series.", within=(1, 2000))
+CHEMISTRY: Final = option(
+    "--chemistry", "oxide|lfp", "Chemistry of the cells, where no model states it."
+)
+CELLS: Final = option(
+    "--cells", "N", "Cells in series, where no model states them.", within=(1, 2000)
+)
 CAPACITY_AH: Final = option(
     "--capacity-ah",
     "A",
-    "Charge from 100 to 0 %. Default: the model's.",
+    "Charge from 100 to 0 %. Default: the model's, where there is one.",
     within=(1e-3, 1e5),
     unit="Ah",
 )

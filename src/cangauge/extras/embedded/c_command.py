@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cangauge.cli.options import JSON, MODEL, option
+from cangauge.cli.options import CAPACITY_AH, CELLS, CHEMISTRY, JSON, MODEL, option
 from cangauge.cli.output import finish, note
 from cangauge.errors import InputError
 
@@ -20,23 +20,9 @@ def export_c_command(
             "-o, --output", "DIR", "Folder for the sources: empty, of an earlier export, or made."
         ),
     ],
-    chemistry: Annotated[
-        Literal["oxide", "lfp"],
-        option("--chemistry", "oxide|lfp", "Without a model: the cells' chemistry, …"),
-    ] = "oxide",
-    cells: Annotated[
-        int | None, option("--cells", "N", "… how many are in series, …", within=(1, 2000))
-    ] = None,
-    capacity_ah: Annotated[
-        float | None,
-        option(
-            "--capacity-ah",
-            "A",
-            "… and the charge from 100 to 0 %.",
-            within=(0.001, 1e5),
-            unit="Ah",
-        ),
-    ] = None,
+    chemistry: Annotated[Literal["oxide", "lfp"], CHEMISTRY] = "oxide",
+    cells: Annotated[int | None, CELLS] = None,
+    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
     platform: Annotated[
         Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"],
         option(
@@ -59,6 +45,8 @@ def export_c_command(
     json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller.
+
+    Without a model, chemistry, cells and capacity give that of the typical cell.
 
     Examples
     --------

@@ -14,6 +14,9 @@ import typer
 from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
 from cangauge.cli.options import (
+    CAPACITY_AH,
+    CELLS,
+    CHEMISTRY,
     JSON,
     MODEL,
     REPORT,
@@ -37,24 +40,9 @@ def judge_command(
     ],
     *,
     model: Annotated[Path | None, MODEL] = None,
-    chemistry: Annotated[
-        Literal["oxide", "lfp"] | None,
-        option("--chemistry", "oxide|lfp", "Without a model: the cells' chemistry, …"),
-    ] = None,
-    cells: Annotated[
-        int | None, option("--cells", "N", "… and how many are in series.", within=(1, 2000))
-    ] = None,
-    capacity_ah: Annotated[
-        float | None,
-        option(
-            "--capacity-ah",
-            "A",
-            "Charge from 100 to 0 % that the gauge should count with. Default: the model's; without"
-            " a model, from the gauge's own count.",
-            within=(0.001, 1e5),
-            unit="Ah",
-        ),
-    ] = None,
+    chemistry: Annotated[Literal["oxide", "lfp"] | None, CHEMISTRY] = None,
+    cells: Annotated[int | None, CELLS] = None,
+    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
     output: Annotated[
         Path | None,
         option(
@@ -94,7 +82,8 @@ def judge_command(
     The logs are of one pack, best of several days, with the published SoC as soc_pct. What happened
     between two logs need not be known. Three lines answer: by how much the gauge is off now, what
     happened before and why, and what to do next. Where the logs cannot tell, it says so. Positive
-    current discharges.
+    current discharges. Without a model, give --chemistry and --cells; the capacity is then that of
+    the gauge's own count, unless it is given.
 
     FILE has one row per sample: log, time_s [s], published_pct, corrected_pct and
     corrected_std_pct [%].

@@ -8,7 +8,16 @@ from typing import Annotated
 
 import typer
 
-from cangauge.cli.options import JSON, ReadingOptions, argument, assumed_of, command, option
+from cangauge.cli.options import (
+    CAPACITY_AH,
+    CELLS,
+    JSON,
+    ReadingOptions,
+    argument,
+    assumed_of,
+    command,
+    option,
+)
 from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
@@ -19,24 +28,13 @@ def gap_check_command(
         list[Path] | None,
         argument(
             "[LOG]…",
-            "Your own logs without a fault, four at least, whose headings are plain or named by"
-            " [columns] of the map file. Default: a simulated pack.",
+            "Your own logs without a fault, four at least, with --capacity-ah and --cells. Headings"
+            " are plain or named by [columns] of the map file. Default: a simulated pack.",
         ),
     ] = None,
     *,
-    capacity_ah: Annotated[
-        float | None,
-        option(
-            "--capacity-ah",
-            "A",
-            "Charge of the logs' pack from 100 to 0 %; needed with LOGs.",
-            within=(0.001, 1e5),
-            unit="Ah",
-        ),
-    ] = None,
-    cells: Annotated[
-        int, option("--cells", "N", "Cells in series of the logs' pack.", within=(1, 2000))
-    ] = 96,
+    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
+    cells: Annotated[int, CELLS] = 96,
     at_most: Annotated[
         int | None,
         option("--at-most", "N", "Leave out at most this many logs.", within=(1, math.inf)),
