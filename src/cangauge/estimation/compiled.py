@@ -112,7 +112,7 @@ class CompiledEstimator(Estimator):
         online, forms = self.online, core_forms(self.online)
         self.native: Any = _core.Core(
             _arrays(model_constants(self, forms) | _of_effects(forms)),
-            _arrays(settings_constants(model, self.settings)),
+            _arrays(settings_constants(self)),
             int(2.0 * online.delay_line.longest_s / SPACING_S) + 2 * BLOCK,
             BLOCK,
             SPACING_S,
@@ -180,10 +180,6 @@ class CompiledEstimator(Estimator):
 
     def _unpack(self, packed: bytes, age_s: float) -> None:
         self.native.restore(packed, age_s)
-
-    def _soc(self) -> tuple[float, float]:
-        latest = self.estimate
-        return latest.soc_pct, latest.soc_std_pct
 
     def _refresh(self) -> None:
         """Show the reference what health, power and cells are computed from."""

@@ -7,15 +7,13 @@ writes them as initialisers.
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.validity import temperature_mismatch
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.extended import OnlineModel
-from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
+from cangauge.settings import Method
 
 KINDS: Final = (
     "no_effect",
@@ -37,8 +35,6 @@ KINDS: Final = (
     "weak_cell",
 )
 """Kinds of effects, in the order of `cg_effect_kind`."""
-METHODS: Final = ("ekf", "newton", "coulomb")
-"""Methods, in the order of `cg_method`."""
 NOISE: Final = (
     "level_std_v",
     "slow_std_v",
@@ -139,17 +135,16 @@ def model_constants(estimator: Estimator, forms: list[CoreForm]) -> Constants:
     return constants
 
 
-def settings_constants(model: Model, settings: EstimatorSettings) -> Constants:
+def settings_constants(estimator: Estimator) -> Constants:
     """Return the fields of a `cg_settings`."""
-    start = settings.initial_soc_pct
-    mismatch = temperature_mismatch(model.temperature_source, settings.temperature_source)
+    settings, start = estimator.settings, estimator.settings.initial_soc_pct
     constants = {
-        "method": METHODS.index(settings.method),
+        "method": get_args(Method).index(settings.method),  # as `cg_method`
         "initial_soc_pct": math.nan if start is None else start,
         "initial_soc_std_pct": settings.initial_soc_std_pct,
         "valid_std_pct": settings.valid_std_pct,
         "gap_s": settings.gap_s,
-        "reasons": int(mismatch),
+        "reasons": int(estimator.always),
         "full_voltage_v": math.nan,
         "rest_after_s": math.nan,
     }

@@ -38,7 +38,6 @@ from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, detect_references, since
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
-from cangauge.estimation.validity import drop_implausible, temperature_mismatch
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
@@ -47,6 +46,8 @@ from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import (
     CURRENT_AT_MOST_A,
     REASONS,
+    TEMPERATURE_WITHIN_C,
+    VOLTAGE_WITHIN,
     Estimate,
     Health,
     Power,
@@ -104,6 +105,8 @@ class Estimator:
         The filter, or two while a start is in doubt.
     tests : tuple of int, float and float
         Number of blocks tested together, and the limits of their innovations and of the strain.
+    always : Reason
+        Reasons that hold throughout.
     is_refused : bool
         Whether the latest sample was refused: without a plausible current, or not later.
 
@@ -143,9 +146,9 @@ class Estimator:
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
         strain_at_most = float(chdtri(self.online.functions.number + 4, ALARM))
         self.tests = tested, float(chdtri(tested, ALARM)), strain_at_most
-        self._mismatch = temperature_mismatch(
-            self.model.temperature_source, self.settings.temperature_source
-        )
+        of_model, of_input = self.model.temperature_source, self.settings.temperature_source
+        is_same = "unknown" in {of_model, of_input} or of_model == of_input
+        self.always = Reason.NONE if is_same else Reason.TEMPERATURE_SOURCE_MISMATCH
         self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
         if self.settings.initial_soc_pct is not None:
@@ -178,7 +181,7 @@ class Estimator:
         if time_s is None:
             return
         memory, stamp_s = self._memory, sample.time_s
-        sample, implausible = drop_implausible(
+        sample, implausible = _drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         if memory.samples == 0:
@@ -213,10 +216,12 @@ class Estimator:
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""
         self._refresh()
-        soc_pct, std_pct = self._soc()
-        if math.isnan(soc_pct) or math.isnan(self._counter.time_s):
+        latest = self.estimate
+        if math.isnan(latest.soc_pct) or math.isnan(self._counter.time_s):
             return Power()
-        return self._power.at(self.hypotheses.likelier, soc_pct, std_pct, self._temperature_c)
+        return self._power.at(
+            self.hypotheses.likelier, latest.soc_pct, latest.soc_std_pct, self._temperature_c
+        )
 
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
@@ -225,13 +230,13 @@ class Estimator:
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
         self._refresh()
-        counter, (soc_pct, std_pct) = self._counter, self._soc()
+        counter, latest = self._counter, self.estimate
         is_counting = not math.isnan(counter.time_s)
         _, load_v, drop_v = self._load() if is_counting else (None, math.nan, math.nan)
         return PackTick(
             time_s=sample.time_s,
-            soc_pct=soc_pct,
-            soc_std_pct=std_pct,
+            soc_pct=latest.soc_pct,
+            soc_std_pct=latest.soc_std_pct,
             voltage_v=sample.voltage_v,
             without_ocv_v=load_v,
             drop_v=drop_v,
@@ -463,7 +468,7 @@ class Estimator:
         soc_pct, std_pct = self._soc()
         known = self.voltage_model.range
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
-        bits = int(self._mismatch) | int(implausible)
+        bits = int(self.always) | int(implausible)
         for is_set, reason in (
             (math.isnan(soc_pct), Reason.NO_INITIAL_SOC),
             (std_pct > self.settings.valid_std_pct, Reason.SOC_UNCERTAIN),
@@ -632,6 +637,24 @@ class Estimator:
         *numbers, status, reasons, samples = parts["latest"]
         self._latest = Estimate._make([*numbers, Status(status), Reason(reasons), samples])
         self.is_refused = False
+
+
+def _drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
+    """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
+
+    `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
+    """
+    reason = Reason.NONE
+    low, high = VOLTAGE_WITHIN
+    for name, least, most in (
+        ("voltage_v", low * nominal_v, high * nominal_v),
+        ("temperature_c", *TEMPERATURE_WITHIN_C),
+    ):
+        value = getattr(sample, name)
+        if value < least or value > most:  # false for NaN
+            sample = sample._replace(**{name: math.nan})
+            reason = Reason.IMPLAUSIBLE_INPUT
+    return sample, reason
 
 
 def _is_outside(value: float, within: tuple[float, float]) -> bool:

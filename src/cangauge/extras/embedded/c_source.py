@@ -98,7 +98,7 @@ def exported_constants(model: Model) -> CoreConstants:
         ) from lacking
     return CoreConstants(
         model_constants(estimator, forms),
-        settings_constants(model, estimator.settings),
+        settings_constants(estimator),
         forms,
         estimator.online.delay_line.longest_s,
     )
