@@ -161,7 +161,7 @@ def test_a_fit_is_shown_in_ten_lines(fitted: cangauge.Identification) -> None:
     low, high = fitted.model.range.soc_pct
     assert 5 < len(repr(fitted).splitlines()) <= 10
     for text in (repr(fitted), fitted._repr_html_()):
-        assert f"{low:.0f} … {high:.0f} % SoC" in text
+        assert f"{low:.1f} … {high:.1f} %" in text
 
 
 def test_an_estimate_shows_itself_in_a_line(

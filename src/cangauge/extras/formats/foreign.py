@@ -69,7 +69,7 @@ _FORMATS: Final = (
         "read the sensors from the history of Home Assistant or of InfluxDB, as CSV",
     ),
     (
-        rb"[^\s=]+(,[^\s=]+=\S+)? [^\s=]+=\S+( \d+)?\r?\n",
+        rb"[^\s,=]+(,[^\s,=]+=[^\s,]+)* [^\s=]+=\S+( \d+)?\r?\n",
         "InfluxDB's line protocol",
         "export it from InfluxDB as CSV: influx query --raw, or influx -format csv",
     ),
