@@ -78,7 +78,11 @@ def prepared(text: str, path: Path) -> tuple[str, list[str]]:
 
 def _without_content(text: str) -> str:
     """Return a text whose quoted parts are blank: places in it are places in the original."""
-    return _QUOTED.sub(lambda match: '"' + " " * (len(match[0]) - 2) + '"', text)
+    return _QUOTED.sub(_blank, text)
+
+
+def _blank(quoted: re.Match[str]) -> str:
+    return '"' + " " * (len(quoted[0]) - 2) + '"'
 
 
 def _with_flags(text: str, ids: list[re.Match[str]]) -> str:

@@ -316,7 +316,7 @@ class SampleDecoder:
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
-            route.checker.learned_period_s = lambda: health.period_s
+            route.checker.learned_period_s = health.learned_period_s
         is_present = signal.codec.is_in if is_multiplexed else None
         route.inputs.append(_Input(signal.codec.decode, is_present, health))
 

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final, Literal
 
 import can
@@ -153,7 +154,7 @@ def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
             raise InputError(problem, field="--bus-option", value=text, cure=cure)
         options[key] = {"true": True, "false": False}.get(value.lower(), value)
         if options[key] is value:
-            for kind in (float, lambda word: int(word, 0)):
+            for kind in (float, partial(int, base=0)):
                 with suppress(ValueError):
                     options[key] = kind(value)
     return options

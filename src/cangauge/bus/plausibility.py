@@ -260,6 +260,10 @@ class SignalHealth:
         """Whether the signal is invalid, or failed too often in a row to become valid."""
         return self.is_invalid or self._failures >= self._checks.invalid_after
 
+    def learned_period_s(self) -> float:
+        """Return `period_s`."""
+        return self.period_s
+
     @property
     def period_s(self) -> float:
         """Period of the values, stated or learned [s]; NaN while not known.

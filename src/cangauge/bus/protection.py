@@ -298,6 +298,10 @@ RUN: Final = 64
 """Frames in sequence that show the period of their sender: others would lie between them."""
 
 
+def _unknown_period_s() -> float:
+    return math.nan
+
+
 class FrameChecker:
     """Check the frames of one message in order of time.
 
@@ -334,7 +338,7 @@ class FrameChecker:
         self._surplus = 0.0
         self._run, self._run_s = 0, 0.0
         self.lost = 0
-        self.learned_period_s: Callable[[], float] = lambda: math.nan
+        self.learned_period_s = _unknown_period_s
 
     @property
     def suspects_second_sender(self) -> bool:

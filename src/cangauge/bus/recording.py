@@ -278,7 +278,9 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
             _keep(decoder.handle(message), decoder, values)
     for _, decoder, values in buses.values():
         _keep(decoder.flush(), decoder, values)
-    channel, (own, decoder, values) = max(buses.items(), key=lambda item: len(item[1][2]))
+    counts = {channel: len(values) for channel, (_, _, values) in buses.items()}
+    channel = max(counts, key=counts.__getitem__)
+    own, decoder, values = buses[channel]
     statistics = decoder.statistics
     if not values:
         raise _without_current(path, vehicle, statistics)

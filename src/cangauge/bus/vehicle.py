@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from can.typechecking import CanFilter
-from cantools.database.can import Database, Message
+from cantools.database.can import Message
 
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
@@ -325,12 +325,17 @@ class _Binder:
             wanted.timeout_s,
         )
 
-    def _in_first(self, find: Callable[[Database, Path], _T]) -> tuple[_T, Path]:
-        """Return what `find` gives in the first DBC that has it; raise the first DBC's error."""
+    def _in_first(
+        self, find: Callable[..., _T], field: str, *names: str | int | None
+    ) -> tuple[_T, Path]:
+        """Return what `find` gives for names in the first DBC that has them, and the DBC.
+
+        Raises the first DBC's error.
+        """
         errors = []
         for database, file in self._databases:
             try:
-                return find(database, file), file
+                return find(database, *names, source=file, field=field), file
             except InputError as error:
                 errors.append(error)
         raise errors[0]
@@ -339,11 +344,7 @@ class _Binder:
         return None if wanted is None else self._signal(role, wanted)
 
     def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
-        (message, signal), file = self._in_first(
-            lambda database, file: find_signal(
-                database, wanted.message, wanted.signal, source=file, field=role
-            )
-        )
+        (message, signal), file = self._in_first(find_signal, role, wanted.message, wanted.signal)
         codec = signal_codec(
             message,
             signal,
@@ -430,10 +431,7 @@ class _Binder:
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""
-        field = f"messages.{name}"
-        message, _ = self._in_first(
-            lambda database, file: find_message(database, name, source=file, field=field)
-        )
+        message, _ = self._in_first(find_message, f"messages.{name}", name)
         return _key(message)
 
 

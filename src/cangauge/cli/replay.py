@@ -6,7 +6,6 @@ import math
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cangauge._text import duration, number
@@ -105,11 +104,11 @@ def replay_command(
     loaded = load_config(config, {"model": "-", **config_values(options)})
     ids = loaded.ids
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
-    stopped = Event()
+    stopped: list[bool] = []
     factor = math.inf if speed == "max" else speed
     settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
     with ExitStack() as stack:
-        stack.enter_context(stop_on_signals(stopped.set))
+        stack.enter_context(stop_on_signals(partial(stopped.append, True)))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
@@ -118,13 +117,16 @@ def replay_command(
         def show(state: ReplayState) -> None:
             show_line(_line(state))
 
-        state = play(bus, source, settings, stop=stopped.is_set, show=show)
+        def is_stopped() -> bool:
+            return bool(stopped)
+
+        state = play(bus, source, settings, stop=is_stopped, show=show)
     note(_line(state))
     if bus.unsent:
         note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")
     if json_output:
         emit_json(_as_json(state, bus, source))
-    if stopped.is_set() and not loop:
+    if stopped and not loop:
         raise KeyboardInterrupt
 
 

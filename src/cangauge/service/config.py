@@ -21,7 +21,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -407,9 +407,7 @@ class RunConfig(Strict):
             key = (error.field or "").removeprefix("--").replace("-", "_")
             if error.source is not None or key in self._options or self._file == _NO_FILE:
                 raise
-            cure = error.cure and re.sub(
-                "--([a-z][a-z-]*)", lambda option: option[1].replace("-", "_") + " =", error.cure
-            )
+            cure = error.cure and re.sub("--([a-z][a-z-]*)", _as_key, error.cure)
             raise InputError(
                 error.problem, source=self._file, field=key, value=error.value, cure=cure
             ) from error
@@ -422,6 +420,10 @@ _IN_THE_MAP: Final = {
     "checks": f"state those of [checks.current] under [current] {_MAP_CURE}",
 }
 """Tables that a configuration could hold before, and where they are now."""
+
+
+def _as_key(option: re.Match[str]) -> str:
+    return option[1].replace("-", "_") + " ="
 
 
 def load_config(
@@ -440,7 +442,9 @@ def load_config(
     validated(RunConfig, {"model": "-", **data}, path or "")
     for each in config_keys():
         *tables, name = each.name.split(".")
-        table = reduce(lambda found, key: found.get(key, {}), tables, data)
+        table = data
+        for key in tables:
+            table = table.get(key, {})
         if path is not None and each.is_path and name in table:
             table[name] = str(Path(path).parent / table[name])
     if given.keys() & {"vehicle", "dbc", "map"}:  # replaces the file's vehicle as a whole

@@ -38,6 +38,10 @@ class _Repetitions:
     held: logging.LogRecord | None = None
 
 
+def _created(held: tuple[_Repetitions, logging.LogRecord]) -> float:
+    return held[1].created
+
+
 class RateLimitedHandler(logging.Handler):
     """Limit each event to one record per interval; the latest suppressed one follows at its end.
 
@@ -76,7 +80,7 @@ class RateLimitedHandler(logging.Handler):
         with self.lock:  # type: ignore[union-attr] # made by Handler
             now_s = self._clock()
             held = [(each, each.held) for each in self._events.values() if each.held is not None]
-            for event, record in sorted(held, key=lambda each: each[1].created):
+            for event, record in sorted(held, key=_created):
                 if everything or now_s >= event.next_s:
                     event.suppressed -= 1
                     self._write(event, record, now_s)

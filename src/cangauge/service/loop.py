@@ -68,6 +68,10 @@ ECHO_WITHIN_S: Final = 1.0
 longer in the receive queue."""
 
 
+def do_nothing() -> None:
+    """Do nothing: neither a state is written nor a configuration read."""
+
+
 @dataclass(frozen=True)
 class LoopSettings:
     """Time-outs of the loop [s].
@@ -112,8 +116,8 @@ class Loop:
         outputs: Sequence[Output] = (),
         record: Recorder | None = None,
         monitor: Monitor | None = None,
-        checkpoint: Callable[[], None] = lambda: None,
-        reload: Callable[[], LoopSettings | None] = lambda: None,
+        checkpoint: Callable[[], None] = do_nothing,
+        reload: Callable[[], LoopSettings | None] = do_nothing,
     ) -> None:
         self._port, self._pipeline = port, pipeline
         self._settings = settings or LoopSettings()

@@ -100,7 +100,7 @@ class PackHistory:
                 volts = cells.voltage_v[self._row].tolist()
                 self._cell_estimator.update(estimator.pack_tick(sample), volts, [0.0] * cells.count)
         self._row += 1
-        self.add(sample.time_s, lambda: self.report_of(estimator))
+        self.add(sample.time_s, partial(self.report_of, estimator))
 
     def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
         """Keep the report of a sample's time [s], if its interval has begun."""
@@ -338,7 +338,7 @@ def estimate_capture(
             field=vehicle.current.message,
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
-    best = max(found, key=lambda bus: len(bus.estimates))
+    best = max(found, key=_Bus.samples)
     pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
     best.pack.report, counts = pipeline.report(), pipeline.counts
     settings = pipeline.estimator.settings
@@ -379,6 +379,10 @@ def _without_steps_back(time_s: FloatArray) -> FloatArray:
     return np.asarray(time_s[0] + np.concatenate(([0.0], np.cumsum(np.maximum(steps_s, 0.0)))))
 
 
+def _no_values() -> array[float]:
+    return array("d")
+
+
 @dataclass
 class _Bus:
     """One of the buses in a capture; each has its own pipeline."""
@@ -387,7 +391,11 @@ class _Bus:
     pack: PackHistory
     estimates: list[Estimate] = field(default_factory=list)
     # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
-    values: array[float] = field(default_factory=lambda: array("d"))
+    values: array[float] = field(default_factory=_no_values)
+
+    def samples(self) -> int:
+        """Return the number of samples so far."""
+        return len(self.estimates)
 
     def collect(self) -> None:
         sample = self.pipeline.latest_sample

@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
@@ -21,13 +21,13 @@ from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.lifecycle import Notifier, reload_on_hangup, sole_writer, stop_on_signals
-from cangauge.service.loop import Loop, LoopSettings
+from cangauge.service.loop import Loop, LoopSettings, do_nothing
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder, check_recording
 from cangauge.service.setup import Setup, address_of, read_setup
 from cangauge.service.state import StateKeeper, state_path
-from cangauge.service.status import Monitor
+from cangauge.service.status import Monitor, RecordState
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
 from cangauge.service.worker import start_thread
 
@@ -156,8 +156,8 @@ class Service:
                 port,
                 config.model,
                 notifier=notifier,
-                record=lambda: None if self.recorder is None else self.recorder.state,
-                troubles=lambda: [text for each in self._outputs if (text := each.trouble)],
+                record=self._recording,
+                troubles=self._troubles,
                 sign_cure=self._setup.sign_cure,
             )
             self.endpoint = _serve_status(config, monitor, stack)
@@ -176,15 +176,24 @@ class Service:
                 outputs=self._outputs,
                 record=self.recorder,
                 monitor=monitor,
-                checkpoint=(lambda: None) if keeper is None else keeper.checkpoint,
-                reload=lambda: self._poll_reload(monitor),
+                checkpoint=do_nothing if keeper is None else keeper.checkpoint,
+                reload=partial(self._poll_reload, monitor),
             )
-            loop.run(lambda: self._is_stopped)
+            loop.run(self._is_done)
         recording = None if self.recorder is None else str(self.recorder.written)
         used_s = {"cpu_seconds": time.process_time() - began_s}
         status = monitor.final() | used_s | {"recording": recording}
         self._log_end(status)
         return status
+
+    def _is_done(self) -> bool:
+        return self._is_stopped
+
+    def _recording(self) -> RecordState | None:
+        return None if self.recorder is None else self.recorder.state
+
+    def _troubles(self) -> list[str]:
+        return [text for each in self._outputs if (text := each.trouble)]
 
     def apply(self, new: Setup | CangaugeError) -> tuple[LoopSettings | None, str | None]:
         """Use another configuration as a whole, or log why not; return its settings, or that.
@@ -212,12 +221,12 @@ class Service:
             if self._is_reload_due:
                 self._is_reload_due = False
                 self._reading = Future()
-                put = self._reading.set_result
                 monitor.reload_begins()
+                read = partial(_put_setup, self._read, self._reading)
                 try:
-                    start_thread(lambda: put(read_setup(self._read)), "cangauge-reload")
+                    start_thread(read, "cangauge-reload")
                 except CangaugeError as error:
-                    put(error)
+                    self._reading.set_result(error)
             return None
         if not self._reading.done():
             return None
@@ -263,6 +272,10 @@ class Service:
             check_recording(Path(config.record), *_recording_limits(config))
 
 
+def _put_setup(read: Callable[[], RunConfig], into: Future[Setup | CangaugeError]) -> None:
+    into.set_result(read_setup(read))
+
+
 def _recording_limits(config: RunConfig) -> list[float | None]:
     """Return the largest size of a part, and of all parts together [bytes]."""
     limits_mb = config.record_part_mb, config.record_keep_mb
@@ -286,7 +299,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path
     is_auto = config.status_socket == "auto"
     path = socket_path(monitor.latest.status["bus"]) if is_auto else Path(config.status_socket)
     try:
-        server = StatusSocket(path, lambda: monitor.latest.at(time.monotonic()))
+        server = StatusSocket(path, monitor.now)
     except CangaugeError as error:
         if not is_auto:
             raise

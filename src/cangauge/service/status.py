@@ -106,6 +106,10 @@ def _as_utf8(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
+def _no_recording() -> None:
+    """Return that nothing is recorded."""
+
+
 class Monitor:
     """Collect counts in the receive loop; its methods are for the loop's thread.
 
@@ -123,7 +127,7 @@ class Monitor:
         model: str = "",
         *,
         notifier: Notifier | None = None,
-        record: Callable[[], RecordState | None] = lambda: None,
+        record: Callable[[], RecordState | None] = _no_recording,
         troubles: Callable[[], list[str]] = list,
         clock: Callable[[], float] = time.monotonic,
         sign_cure: str = "set the other sign under [current] of the map file",
@@ -149,6 +153,10 @@ class Monitor:
         self._report: Mapping[str, Any] = NO_REPORT
         self._notices: dict[str, str] = {}
         self.latest = Snapshot(now_s, self._object(now_s))
+
+    def now(self) -> dict[str, Any]:
+        """Return the latest object with the ages of this moment; from any thread."""
+        return self.latest.at(self._clock())
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
         """Count a step of the estimator, of `step_s` [s].
