@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 from cangauge._typing import FloatArray, IntArray
 from cangauge.extras.judge.chain import Chain
 from cangauge.extras.judge.faults import Column, Priors, faults, healthy
-from cangauge.model.gaussian import GaussianPosterior, Rows
+from cangauge.model.gaussian import Rows
 
 JOINT_PCT: Final = 0.1
 """NoiseSize of the SoC where one stretch continues another [%]."""
@@ -27,9 +27,6 @@ MOST_MOVES: Final = 10
 """Sets of faults that are tried one after the other."""
 BEYOND: Final = 3.0
 """A fault whose size is beyond so many of its prior standard deviations is no explanation."""
-VOLTAGE_SCALES: Final = (0.5, 1.0, 2.0, 4.0)
-"""Factors on the model's errors of the voltage: a pack on other days may follow its model worse
-than left-out logs did."""
 ITERATIONS: Final = 8
 """Linearisations at most, …"""
 DAMPING: Final = 0.6
@@ -61,23 +58,20 @@ GAUGES: Final = (
     GaugeNoise(0.5, 0.5, 1.0, 10.0, 1.5),
     GaugeNoise(3.0, 1.5, 3.0, 30.0, 3.0),
 )
-"""From a pure counter (a BMW i3's) to a gauge that follows the voltage (`batic_car1`'s)."""
+"""From a pure counter (a BMW i3's) to a gauge that follows the voltage, which counts nothing."""
 
 
-class NoiseSize(NamedTuple):
-    """Size of the noise."""
-
-    voltage: float
-    """One of `VOLTAGE_SCALES`."""
-    gauge: GaugeNoise | None
-    """None: what the gauge published is withheld."""
+USUAL: Final = 1
+"""Place of a usual gauge among them."""
 
 
 class Fitted(NamedTuple):
     """Posterior of a set of faults."""
 
     share: float
-    """Probability among all sets and sizes of the noise."""
+    """Probability among all sets and sizes of the gauge's noise."""
+    is_counter: bool
+    """Whether the gauge counts: what is left of its SoC is below the largest noise."""
     faults: tuple[Column, ...]
     size: FloatArray
     """Of each fault, and its σ."""
@@ -128,38 +122,40 @@ class Linearised:
         self._counted_pct = self._start_pct - chain.blocks.drawn_pct
 
     @cached_property
-    def all_rows(self) -> dict[NoiseSize, Rows]:
-        """Rows at each size of the noise."""
-        of_gauge = [(gauge, self._gauge_rows(gauge)) for gauge in GAUGES]
-        found = dict[NoiseSize, Rows]()
-        for scale in VOLTAGE_SCALES:
-            others = self._voltage_rows(scale) + self._other_rows
-            found |= {NoiseSize(scale, gauge): others + rows for gauge, rows in of_gauge}
-        return found
+    def all_rows(self) -> list[Rows]:
+        """Rows at each of `GAUGES`."""
+        return [self.rows(noise) for noise in GAUGES]
 
-    def rows(self, noise: NoiseSize) -> Rows:
-        """Return the rows at one size of the noise."""
-        rows = self._voltage_rows(noise.voltage) + self._other_rows
-        return rows if noise.gauge is None else rows + self._gauge_rows(noise.gauge)
+    def rows(self, noise: GaugeNoise) -> Rows:
+        """Return the rows at one size of the gauge's noise."""
+        return self.pack_rows + self._gauge_rows(noise)
 
     @cached_property
-    def _voltage(self) -> tuple[FloatArray, FloatArray]:
-        """Columns of the voltage of all blocks, and what it leaves beside the counted SoC [V]."""
-        slope = self.chain.slope(self.soc_pct)
-        error_v = self.chain.blocks.voltage_v - self.chain.voltage_v(self.soc_pct)
-        error_v += slope * (self.soc_pct - self._counted_pct)
-        return slope[:, None] * self._S + self._V, error_v
+    def pack_rows(self) -> Rows:
+        """Rows of the pack: those of the prior, of all voltages, full charges and joints.
 
-    def _voltage_rows(self, scale: float) -> Rows:
-        """Return the rows of all voltages, the level of each stretch integrated out."""
-        found, (X, error_v) = [], self._voltage
-        for stretch in self.chain.stretches:
-            at, covariance = self.chain.voltage_noise(stretch, scale)
-            with_level = np.column_stack([self.chain.level_v[at], X[at]])
+        The level of the voltage of each stretch is integrated out.
+        """
+        chain, counted_pct = self.chain, self._counted_pct
+        slope = chain.slope(self.soc_pct)
+        error_v = chain.blocks.voltage_v - chain.voltage_v(self.soc_pct)
+        error_v += slope * (self.soc_pct - counted_pct)
+        X = slope[:, None] * self._S + self._V
+        found = [Rows.prior(self._std[: len(self.healthy)], others=len(self.faults))]
+        for stretch in chain.stretches:
+            at, covariance = chain.voltage_noise(stretch)
+            with_level = np.column_stack([chain.level_v[at], X[at]])
             rows = Rows.correlated(with_level, error_v[at], _root(covariance))
-            # The level is one number of a stretch: quiet voltages do not prove it small.
-            level = np.array([max(scale, 1.0)])
-            found.append((rows + Rows.prior(level, others=self._std.size)).eliminated(1))
+            found.append((rows + Rows.prior(np.ones(1), others=self._std.size)).eliminated(1))
+        full = np.flatnonzero(chain.is_full)
+        found.append(Rows.of(self._S[full], 100.0 - counted_pct[full], FULL_STD_PCT))
+        later = [k for k, each in enumerate(chain.stretches) if each.continues]
+        first = np.array([chain.stretches[k].blocks.start for k in later], dtype=np.intp)
+        ends = np.array([chain.stretches[k].samples.start - 1 for k in later], dtype=np.intp)
+        drawn_pct = chain.blocks.drawn_pct
+        between_pct = drawn_pct[first] + chain.samples.drawn_pct[ends] - drawn_pct[first - 1]
+        apart_pct = counted_pct[first - 1] - counted_pct[first] - between_pct
+        found.append(Rows.of(self._S[first] - self._S[first - 1], apart_pct, JOINT_PCT))
         return _sum(found)
 
     def _gauge_rows(self, noise: GaugeNoise) -> Rows:
@@ -181,29 +177,13 @@ class Linearised:
             found.append((rows + Rows.prior(own, others=self._std.size)).eliminated(own.size))
         return _sum(found)
 
-    @cached_property
-    def _other_rows(self) -> Rows:
-        """Rows of full charges, of stretches that continue others, and of the prior."""
-        chain, counted_pct = self.chain, self._counted_pct
-        full = np.flatnonzero(chain.is_full)
-        charged = Rows.of(self._S[full], 100.0 - counted_pct[full], FULL_STD_PCT)
-        later = [k for k, each in enumerate(chain.stretches) if each.continues]
-        first = np.array([chain.stretches[k].blocks.start for k in later], dtype=np.intp)
-        ends = np.array([chain.stretches[k].samples.start - 1 for k in later], dtype=np.intp)
-        drawn_pct = chain.blocks.drawn_pct
-        between_pct = drawn_pct[first] + chain.samples.drawn_pct[ends] - drawn_pct[first - 1]
-        apart_pct = counted_pct[first - 1] - counted_pct[first] - between_pct
-        joined = Rows.of(self._S[first] - self._S[first - 1], apart_pct, JOINT_PCT)
-        prior = Rows.prior(self._std[: len(self.healthy)], others=len(self.faults))
-        return charged + joined + prior
-
     def log_weights(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Return ln of the weight of a set of faults, and with each other fault added to it.
 
         Returns
         -------
-        base : array of shape (noises,)
-        more : array of shape (noises, faults)
+        base : array of shape (gauges,)
+        more : array of shape (gauges, faults)
             −∞ for other shapes of those in the set.
         """
         taken = {self.faults[k].place for k in chosen}
@@ -212,7 +192,7 @@ class Linearised:
         )
         std = self._fault_std(others)
         base, more = [], np.full((len(self.all_rows), len(self.faults)), -np.inf)
-        for k, rows in enumerate(self.all_rows.values()):
+        for k, rows in enumerate(self.all_rows):
             of_set = self._chosen(rows, chosen, others)
             added = of_set.added(len(self.healthy) + len(chosen), std)
             base.append(added.log_evidence + float(self._log_prior[list(chosen)].sum()))
@@ -233,23 +213,20 @@ class Linearised:
         prior = np.eye(len(chosen), rows.table.shape[1] - 1, n)
         return rows + Rows.of(prior, np.zeros(len(chosen)), self._fault_std(chosen))
 
-    def solved(self, chosen: Sequence[int], rows: Rows) -> tuple[GaussianPosterior, FloatArray]:
-        """Return the posterior of the healthy columns and a set of faults, and the SoC with it."""
-        posterior = self._chosen(rows, chosen, np.zeros(0, dtype=np.intp)).posterior()
-        n = len(self.healthy)
-        S = self._S[:, [*range(n), *(n + k for k in chosen)]]
-        return posterior, self._counted_pct + S @ posterior.mean
-
-    def fitted(self, chosen: Sequence[int], rows: Rows, share: float) -> Fitted:
+    def fitted(
+        self, chosen: Sequence[int], rows: Rows, share: float = 1.0, *, is_counter: bool = True
+    ) -> Fitted:
         """Return the posterior of a set of faults of a probability."""
-        posterior, pack_pct = self.solved(chosen, rows)
         n, zero = len(self.healthy), len(self.chain.stretches)
+        posterior = self._chosen(rows, chosen, np.zeros(0, dtype=np.intp)).posterior()
         X = self._S[:, [*range(n), *(n + k for k in chosen)]]
+        pack_pct = self._counted_pct + X @ posterior.mean
         X[:, zero] = 1.0
         units = np.array([self.faults[k].per_unit for k in chosen])
         functions = slice(zero + 1, zero + 1 + self.chain.functions.number)
         return Fitted(
             share=share,
+            is_counter=is_counter,
             faults=tuple(self.faults[k] for k in chosen),
             size=posterior.mean[n:] * units,
             std=np.sqrt(np.diag(posterior.covariance)[n:]) * units,
@@ -277,36 +254,39 @@ def _sum(rows: Sequence[Rows]) -> Rows:
     return Rows(table, sum(each.log_norm for each in rows)).reduced()
 
 
+class _Weighed(NamedTuple):
+    """A set of faults at a size of the gauge's noise, with ln of its weight."""
+
+    log_weight: float
+    faults: tuple[int, ...]
+    gauge: int
+    at: Linearised
+
+
 def explain(chain: Chain, priors: Priors) -> list[Fitted]:
     """Return the sets of faults that explain the logs, the most probable first.
 
     The voltage is linearised at the SoC that it shows itself, with the gauge withheld, and at the
     published one, so that its curvature accuses no gauge.
     """
-    withheld = _settled(chain, priors, chain.fitting_pct, [], NoiseSize(1.0, None))
-    published = chain.published_or(chain.fitting_pct)
-    right = _settled(chain, priors, published, [], NoiseSize(1.0, GAUGES[1]))
+    withheld = _settled(chain, priors, chain.fitting_pct, [], None)
+    right = _settled(chain, priors, chain.published_or(chain.fitting_pct), [], USUAL)
     found = [*_explained(chain, priors, withheld), *_explained(chain, priors, right)]
     log_total = logsumexp([each.log_weight for each in found])
-    kept = []
+    fits = []
     for is_free in (False, True):
-        of = [each for each in found if each.at.is_free(each.faults) == is_free]
-        least = max((each.log_weight for each in of), default=0.0) + np.log(LEAST_SHARE)
-        kept += [each for each in of if each.log_weight >= least]
-    fits = [
-        each.at.fitted(each.faults, each.rows, float(np.exp(each.log_weight - log_total)))
-        for each in kept
-    ]
-    return sorted(fits, key=lambda each: -each.share)
+        some = [each for each in found if each.at.is_free(each.faults) == is_free]
+        least = max((each.log_weight for each in some), default=0.0) + np.log(LEAST_SHARE)
+        for weight, chosen, gauge, at in some:
+            if weight >= least:
+                share, is_counter = float(np.exp(weight - log_total)), gauge < len(GAUGES) - 1
+                rows = at.all_rows[gauge]
+                fits.append(at.fitted(chosen, rows, share, is_counter=is_counter))
+    return sorted(fits, key=_share, reverse=True)
 
 
-class _Weighed(NamedTuple):
-    """A set of faults at a size of the noise, with ln of its weight."""
-
-    log_weight: float
-    faults: tuple[int, ...]
-    rows: Rows
-    at: Linearised
+def _share(fit: Fitted) -> float:
+    return fit.share
 
 
 def _explained(chain: Chain, priors: Priors, soc_pct: FloatArray) -> list[_Weighed]:
@@ -321,17 +301,17 @@ def _explained(chain: Chain, priors: Priors, soc_pct: FloatArray) -> list[_Weigh
         best = max(weights, key=lambda faults: float(logsumexp(weights[faults])))
         if best == chosen:
             break
-        chosen, noise = best, list(at.all_rows)[int(np.argmax(weights[best]))]
-        soc = _settled(chain, priors, soc, sorted(chosen), noise)
+        chosen = best
+        soc = _settled(chain, priors, soc, sorted(chosen), int(np.argmax(weights[best])))
     return [
-        _Weighed(float(weight), tuple(sorted(some)), rows, at)
-        for some, of_noises in weights.items()
-        for rows, weight in zip(at.all_rows.values(), of_noises, strict=True)
+        _Weighed(float(weight), tuple(sorted(some)), gauge, at)
+        for some, of_gauges in weights.items()
+        for gauge, weight in enumerate(of_gauges)
     ]
 
 
 def _neighbourhood(at: Linearised, chosen: Sequence[int]) -> dict[frozenset[int], FloatArray]:
-    """Return ln weights, over the noises, of a set and of all that differ from it by one fault.
+    """Return ln weights, over `GAUGES`, of a set and of all that differ from it by one fault.
 
     Those of no fault and of one alone are always among them.
     """
@@ -345,13 +325,14 @@ def _neighbourhood(at: Linearised, chosen: Sequence[int]) -> dict[frozenset[int]
 
 
 def _settled(
-    chain: Chain, priors: Priors, soc_pct: FloatArray, chosen: Sequence[int], noise: NoiseSize
+    chain: Chain, priors: Priors, soc_pct: FloatArray, chosen: Sequence[int], gauge: int | None
 ) -> FloatArray:
     """Return the SoC at which the voltage is linearised: that which follows from it."""
     soc = soc_pct
     for _ in range(ITERATIONS):
         at = Linearised(chain, priors, soc, chosen)
-        _, found = at.solved(range(len(chosen)), at.rows(noise))
+        rows = at.pack_rows if gauge is None else at.rows(GAUGES[gauge])
+        found = at.fitted(range(len(chosen)), rows).pack_pct
         step = np.clip(found, -3.0, 103.0) - soc
         if np.abs(step).max() < SETTLED_PCT:
             break

@@ -35,6 +35,8 @@ AGREES_FROM: Final = 0.9
 """… and agrees where it is below `AGREES_PCT` [%] with this one."""
 NAMED: Final = 0.9
 """A fault is named from this probability, …"""
+BESIDE_COUNT: Final = ("table", "voltage_sensor")
+"""Places of faults that are named also where the gauge counts no charge, …"""
 MATERIAL_PCT: Final = 2.0
 """… where it moves the published SoC by this somewhere: less is the gauge's resolution."""
 FITTED: Final = Priors(1.5, 0.75, 0.25)
@@ -309,16 +311,19 @@ def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> li
     for fit in fits:
         for column, size, std in zip(fit.faults, fit.size, fit.std, strict=True):
             place = (column.name, *column.place[1:])
-            shapes.setdefault(place, []).append((column, fit.share, float(size), float(std)))
+            share = fit.share if fit.is_counter or column.place[0] in BESIDE_COUNT else 0.0
+            shapes.setdefault(place, []).append((column, share, float(size), float(std)))
     found = []
     for of_place in shapes.values():
         share, sizes, stds = np.array([numbers for _, *numbers in of_place]).T
         column, probability = of_place[int(np.argmax(share))][0], float(share.sum())
+        if probability < NAMED:
+            continue
         within = share / probability
         size = float(within @ sizes)
         std = float(np.sqrt(within @ (stds**2 + (sizes - size) ** 2)))
         is_possible = abs(size) <= BEYOND * column.std * column.per_unit
-        if probability < NAMED or not is_possible or _moves_pct(chain, column, size) < MATERIAL_PCT:
+        if not is_possible or _moves_pct(chain, column, size) < MATERIAL_PCT:
             continue
         since = None
         if column.piece > 0 or column.since:
