@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 import cangauge
@@ -100,8 +99,8 @@ def numbers(lines: Sequence[dict]) -> dict[str, str]:
     healthy = [line for line in lines if line["fault"] in HEALTHY]
     large = [line for line in lines if abs(line["true_pct"]) > LARGE_PCT]
     small = [line for line in lines if abs(line["true_pct"]) < SMALL_PCT]
-    _, _, within, found, _, right = row(lines)
-    faulty = [bool(line["faults"]) for line in lines if line["causes"]]
+    faulty = [line for line in lines if line["causes"]]
+    named = [line for line in faulty if line["faults"]]
     resets = [line for line in lines if line["fault"].startswith("self_reset")]
     weak = [line for line in lines if line["lack_pct"]]
     cpu_s = [line["cpu_s"] for line in lines]
@@ -109,10 +108,10 @@ def numbers(lines: Sequence[dict]) -> dict[str, str]:
         "Alarms on healthy chains": share([is_verdict(line, "off") for line in healthy]),
         '"off" where the error is below 3 %': share([is_verdict(line, "off") for line in small]),
         '"agrees" where it is above 5 %': share([is_verdict(line, "agrees") for line in large]),
-        '"off" where it is above 5 %': found,
-        "Error within 2σ": within,
-        "A cause named, of faulty gauges": share(faulty),
-        "All faults named and no other, of those named": right,
+        '"off" where it is above 5 %': share([is_verdict(line, "off") for line in large]),
+        "Error within 2σ": share([is_within(line) for line in lines]),
+        "A cause named, of faulty gauges": share([bool(line["faults"]) for line in faulty]),
+        "All faults named and no other, of those named": share([is_right(line) for line in named]),
         "Size of a weak cell inside its interval": share([is_inside(line) for line in weak]),
         "Moment of a self-reset within ten minutes": share(
             [line["reset_off_s"][0] <= 600.0 for line in resets]
@@ -121,46 +120,21 @@ def numbers(lines: Sequence[dict]) -> dict[str, str]:
     }
 
 
-def by_fault(lines: Sequence[dict]) -> list[Table]:
-    """Return a table of all faults with a model of the pack, and one without."""
-    tables = []
-    for title, of in (("With a model", True), ("Without a model", False)):
-        table = Table(title=title, box=box.SIMPLE)
-        for head in ("fault", "off", "agrees", "within 2σ", "above 5 %: off", "named", "right"):
-            table.add_column(head)
-        some = [line for line in lines if line["model"] == of]
-        for fault in dict.fromkeys(line["fault"] for line in some):
-            table.add_row(fault, *row([line for line in some if line["fault"] == fault]))
-        tables.append(table)
-    return tables
+def is_verdict(line: dict, verdict: str) -> bool:
+    """Return whether a line has a verdict."""
+    return line["now"]["verdict"] == verdict
+
+
+def is_within(line: dict) -> bool:
+    """Return whether the error lies within 2σ."""
+    now = line["now"]
+    return abs(now["error_pct"] - line["true_pct"]) <= 2.0 * now["sigma_pct"]
 
 
 def is_inside(line: dict) -> bool:
     """Return whether a weak cell is found, and its size inside its interval."""
     found = [fault["interval"] for fault in line["faults"] if fault["fault"] == "weak_cell"]
     return any(low <= line["lack_pct"] <= high for low, high in found)
-
-
-def is_verdict(line: dict, verdict: str) -> bool:
-    """Return whether a line has a verdict."""
-    return line["now"]["verdict"] == verdict
-
-
-def row(lines: Sequence[dict]) -> list[str]:
-    """Return the cells of a table for some lines."""
-    large = [line for line in lines if abs(line["true_pct"]) > LARGE_PCT]
-    within = [
-        abs(x["now"]["error_pct"] - x["true_pct"]) <= 2.0 * x["now"]["sigma_pct"] for x in lines
-    ]
-    named = [line for line in lines if line["faults"] and line["causes"]]
-    return [
-        share([is_verdict(line, "off") for line in lines]),
-        share([is_verdict(line, "agrees") for line in lines]),
-        share(within),
-        share([is_verdict(line, "off") for line in large]),
-        share([bool(line["faults"]) for line in lines]),
-        share([is_right(line) for line in named]),
-    ]
 
 
 def is_right(line: dict) -> bool:
@@ -183,8 +157,6 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.table:
         lines = [json.loads(line) for line in arguments.table.read_text().splitlines()]
-        for each in by_fault(lines):
-            Console(width=130).print(each)
         describes = ["src/cangauge/extras/judge", "benchmarks/judge"]
         publish("judge", [summary(lines)], describes, keeps=arguments.keep)
     else:

@@ -46,9 +46,6 @@ SETTLING_H: Final = 0.025
 WANDER_S: Final = 1200.0
 """Time over which the level of the voltage also wanders [s]: the curve's features pass by, and the
 pack warms up."""
-WITHIN_LOG: Final = 0.5
-"""Part of the model's voltage errors that varies within a stretch [-]; they hold what differs from
-log to log too. Of 0.5, 1, 2 and 4 the evidence of every development chain chose the least."""
 SECANT_PCT: Final = 1.0
 """Half width over which the curve's slope is taken [%]: about the σ of the SoC."""
 
@@ -233,21 +230,25 @@ class Chain:
         """Standard deviation of the level of the voltage's error at each block [V]."""
         return np.hypot(self._cold * self.model.noise.level_std_v, self._axis_v)
 
-    def voltage_noise(self, stretch: Stretch) -> tuple[IntArray, FloatArray]:
-        """Return the blocks of a stretch with a voltage, and the covariance of their errors [V²].
+    def voltage_noise(self, part: float) -> list[tuple[IntArray, FloatArray]]:
+        """Return the blocks of each stretch with a voltage, and a root of the errors' covariance.
 
-        Without the level that lasts the stretch.
+        Of the model's errors a part varies within the stretch; the level that lasts it is left out.
         """
-        places, noise = stretch.blocks, self.model.noise
-        at = np.flatnonzero(np.isfinite(self.blocks.voltage_v[places])) + places.start
-        hours, cold, level_v = (each[at] for each in (self.blocks.hours, self._cold, self.level_v))
-        apart_s = 3600.0 * np.abs(hours[:, None] - hours)
-        slow = np.outer(cold, cold) * noise.slow_std_v**2 * np.exp(-apart_s / noise.slow_time_s)
-        wander = np.outer(level_v, level_v) * np.exp(-apart_s / WANDER_S)
-        fast = np.diag((cold * noise.fast_std_v) ** 2)
-        least_v = 1e-6 * float(self.blocks.voltage_v[at].mean())
-        own = np.diag(self._axis_v[at] ** 2 + least_v**2)
-        return at, WITHIN_LOG**2 * (slow + wander + fast) + own
+        found, noise = [], self.model.noise
+        for stretch in self.stretches:
+            places = stretch.blocks
+            at = np.flatnonzero(np.isfinite(self.blocks.voltage_v[places])) + places.start
+            cold, level_v = self._cold[at], self.level_v[at]
+            apart_s = 3600.0 * np.abs(self.blocks.hours[at, None] - self.blocks.hours[at])
+            slow = np.outer(cold, cold) * noise.slow_std_v**2 * np.exp(-apart_s / noise.slow_time_s)
+            wander = np.outer(level_v, level_v) * np.exp(-apart_s / WANDER_S)
+            fast_v2 = (part * cold * noise.fast_std_v) ** 2
+            least_v = 1e-6 * float(self.blocks.voltage_v[at].mean())
+            own = np.diag(fast_v2 + self._axis_v[at] ** 2 + least_v**2)
+            root = np.linalg.cholesky(part**2 * (slow + wander) + own)
+            found.append((at, np.asarray(root, dtype=np.float64)))
+        return found
 
     def published_or(self, other_pct: FloatArray) -> FloatArray:
         """Return the published SoC at each block, as it would count on; else another [%]."""

@@ -306,7 +306,7 @@ def _pieces(
 
 
 def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> list[FoundFault]:
-    """Return the faults that are probable, of a possible size, and matter."""
+    """Return the faults that are probable, of a known sign and a possible size, and matter."""
     shapes = dict[tuple[str | int, ...], list[tuple[Column, float, float, float]]]()
     for fit in fits:
         for column, size, std in zip(fit.faults, fit.size, fit.std, strict=True):
@@ -322,7 +322,7 @@ def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> li
         within = share / probability
         size = float(within @ sizes)
         std = float(np.sqrt(within @ (stds**2 + (sizes - size) ** 2)))
-        is_possible = abs(size) <= BEYOND * column.std * column.per_unit
+        is_possible = SURE * std < abs(size) <= BEYOND * column.std * column.per_unit
         if not is_possible or _moves_pct(chain, column, size) < MATERIAL_PCT:
             continue
         since = None

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cangauge._text import counted, number
-from cangauge.extras.judge.result import DAY_S, Judgement, is_dated
+from cangauge.extras.judge.result import Judgement
 from cangauge.extras.judge.text import moment, signed
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
 from cangauge.extras.report.page import Page, Table, Tile, joined
-from cangauge.logs.log import Log
 
 
 def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
@@ -31,7 +29,7 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
     return Page(
         title=f"Second opinion on the gauge of {joined([log.name for log in logs])}",
         lead=first,
-        subtitle=f"{counted(len(logs), 'log')}, {_days(logs)}, judged by {judgement.model.name}.",
+        subtitle=f"{counted(len(logs), 'log')}, judged by {judgement.model.name}.",
         tiles=[
             Tile("Verdict now", judgement.verdict.replace("_", " ")),
             Tile("Error now", number(judgement.error_pct, 1, "% SoC"), f"σ {std}"),
@@ -45,14 +43,6 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
         model_path=model_path,
         logs=logs,
     )
-
-
-def _days(logs: Sequence[Log]) -> str:
-    """Return the number of days with logs: by their stamps, or one for each log."""
-    if not is_dated(logs):
-        return counted(len(logs), "day")
-    stamps = np.concatenate([log.time_s for log in logs])
-    return counted(int(np.unique(np.floor(stamps / DAY_S)).size), "day")
 
 
 def _piece_table(judgement: Judgement) -> Table:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from cangauge._typing import FloatArray
 from cangauge.extras.judge.explain import Fitted
@@ -15,8 +15,6 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
 Verdict = Literal["agrees", "off", "cannot_tell"]
-
-DAY_S: Final = 86400.0
 
 
 class Moment(NamedTuple):

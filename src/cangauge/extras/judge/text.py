@@ -72,8 +72,11 @@ def _now(judgement: Judgement) -> str:
         return f"The gauge is right: its error is {its_error} now."
     if judgement.verdict == "off":
         return f"The gauge reads {_wrong(error, std)} now."
-    if abs(error) > OFF_PCT + std:
-        return f"The gauge probably reads {_wrong(error, std)} now, but these logs do not prove it."
+    if abs(error) > SURE * std:
+        return (
+            f"The gauge probably reads {_wrong(error, std)} now; that it is off by more than"
+            f" {number(OFF_PCT, 0)} % is not certain."
+        )
     return (
         "These logs do not show whether the gauge is right: its error lies between"
         f" {signed(error - SURE * std)} and {signed(error + SURE * std)} % SoC now."
