@@ -147,9 +147,9 @@ class Column:
         What a unit adds to the true SoC and to the published one [%], each relative to a stretch
         that starts with s, and to the voltage beside the change of SoC [V].
     place : tuple
-        A set of faults has one shape of each place.
-    since, piece : int
-        Stretch with which it begins, and piece whose level it is.
+        A set of faults has one shape of each place. Of a level: with the number of its piece.
+    since : int
+        Stretch with which it begins.
     is_positive : bool
         Whether its size has one sign.
     per_unit : float
@@ -165,7 +165,6 @@ class Column:
     volts: FloatArray | float = 0.0
     place: tuple[str | int, ...] = ()
     since: int = 0
-    piece: int = -1
     is_positive: bool = False
     per_unit: float = 1.0
     log_prior: float = 0.0
@@ -261,7 +260,6 @@ def _levels(chain: Chain, piece: int) -> Iterator[Column]:
             shown=_ones((numbers >= low) & (numbers <= high)),
             place=("level", piece, since),
             since=since,
-            piece=piece,
         )
 
 
@@ -282,7 +280,6 @@ def _levels_in_pauses(chain: Chain) -> Iterator[Column]:
                     shown=_ones(shown),
                     place=("level", piece, since),
                     since=since,
-                    piece=piece,
                 )
 
 

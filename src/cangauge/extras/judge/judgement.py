@@ -27,6 +27,7 @@ from cangauge.logs.log import Log, as_log
 from cangauge.logs.read import CellColumns
 from cangauge.model.model_file import PRIOR_MADE_BY, FunctionFields, Model, as_model
 from cangauge.model.prior import ChemistryName
+from cangauge.model.voltage_model import hermite_basis
 
 OFF_FROM: Final = 0.95
 """A gauge is off where its error at the end is above `OFF_PCT` with this probability, …"""
@@ -191,7 +192,15 @@ def _weakest(
         return None
     curve_v = chain.model.voltage_model().pseudo_ocv(CURVE_PCT) / volts[0].shape[1]
     weakest = weak_cell(volts, socs, amps, curve_v, first)
-    return weakest if weakest is not None and weakest.probability >= NAMED else None
+    if weakest is None or weakest.probability < NAMED:
+        return None
+    # A capacity is as well known as the slope of the curve over the SoC that was visited.
+    visited_pct = np.percentile(np.concatenate(socs), [0.0, 100.0])
+    of_functions = hermite_basis(visited_pct, chain.functions.soc_pct) @ chain.functions.value
+    over_v = np.diff(chain.model.voltage_model().pseudo_ocv(visited_pct))
+    slope_std = float(np.linalg.norm(np.diff(of_functions, axis=0)) / over_v[0])
+    std_pct = float(np.hypot(weakest.std_pct, slope_std * weakest.lack_pct))
+    return weakest._replace(std_pct=std_pct)
 
 
 def _judgement(
@@ -281,7 +290,7 @@ def _pieces(
     for fault in best.faults:
         if fault.place[0] == "level":
             changed = np.unique(chain.blocks.stretch[np.asarray(fault.shown) != 0.0])
-            goes_on = np.unique(chain.blocks.stretch[chain.piece == fault.piece])
+            goes_on = np.unique(chain.blocks.stretch[chain.piece == fault.place[1]])
             resets[np.intersect1d([changed[0], changed[-1] + 1], goes_on[1:])] = 1
     published = chain.published
     latest = np.maximum.accumulate(np.maximum(chain.row_piece, 0))
@@ -325,11 +334,11 @@ def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> li
         is_possible = SURE * std < abs(size) <= BEYOND * column.std * column.per_unit
         if not is_possible or _moves_pct(chain, column, size) < MATERIAL_PCT:
             continue
-        since = None
-        if column.piece > 0 or column.since:
-            is_after = chain.samples.stretch >= column.since
-            is_inside = is_after & ((column.piece < 0) | (chain.row_piece == column.piece))
-            since = _moment(chain, int(np.argmax(is_inside)))
+        is_inside = chain.samples.stretch >= column.since
+        if column.place[0] == "level":
+            is_inside &= chain.row_piece == column.place[1]
+        row = int(np.argmax(is_inside))
+        since = _moment(chain, row) if np.max(chain.row_piece[:row], initial=-1) >= 0 else None
         interval = (size - SURE * std, size + SURE * std)
         kind = FAULTS[column.name]
         found.append(
