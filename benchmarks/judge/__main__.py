@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -50,7 +51,10 @@ def run(arguments: argparse.Namespace) -> None:
                 )
                 FAULTS[fault](chain)
                 for with_model in (True, False):
-                    print(json.dumps(judged(chain, with_model=with_model)), flush=True)
+                    try:
+                        print(json.dumps(judged(chain, with_model=with_model)), flush=True)
+                    except cangauge.InputError as refused:
+                        print(f"{pack}, {fault}: {refused}", file=sys.stderr)
 
 
 def judged(chain: Chain, *, with_model: bool) -> dict[str, object]:
