@@ -46,7 +46,8 @@ def row_of(case: dict[str, Any], k: int) -> str:
                "thousand_mv": thousand_mv, "swiss_ma": swiss_ma,
                "filetime": int(10_000_000 * (START.timestamp() + k + 11_644_473_600)),
                "net_ticks": int(10_000_000 * (START.timestamp() + k + 62_135_596_800))}  # fmt: skip
-    return template.format(k=k, **values)
+    way, way_cn = ("Discharging", "恒流放电") if i > 0.0 else ("Charging", "恒流充电")
+    return template.format(k=k, size=abs(i), way=way, way_cn=way_cn, **values)
 
 
 def content_of(case: dict[str, Any]) -> bytes:

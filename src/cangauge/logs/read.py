@@ -26,7 +26,7 @@ from cangauge.logs.proposals import Beginning, proposing
 from cangauge.logs.quantities import FIELDS
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
-from cangauge.logs.values import numbers_of, with_decimal_points
+from cangauge.logs.values import is_number, numbers_of, with_decimal_points
 from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
@@ -215,6 +215,12 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
         named = ",".join(f"{name}=#{k}" for k, name in enumerate([*FIELDS][:count], start=1))
         cure = f"name its {count} columns by number, such as --columns '{named}' ({DOCS})"
         return InputError(problem, source=head.path, cure=cure)
+    rows = [line.split() for line in head.lines[1:5]]
+    if rows and all(len(row) > 2 and all(map(is_number, row)) for row in rows):
+        cure = "separate them by commas: sed -E 's/^ +//; s/ +/,/g' FILE > log.csv"
+        return InputError(
+            f"{problem}: its columns are separated by blanks", source=head.path, cure=cure
+        )
     shown = head.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
     field, value = ("first line", shown[:80]) if is_text else (None, None)

@@ -49,10 +49,13 @@ MAX_COUNTERS: Final = 6
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""
-_STATES: Final = frozenset({"state", "status", "md", "mode", "direction", "dir", "type"})
+_STATES: Final = re.compile(
+    r"(?<![a-z])(?:state|status|md|mode|direction|dir|type|step|command|(?:dis)?charg(?:e|ing))"
+    "(?![a-z])|状态|类型"
+)
 """Words of a heading that may tell the direction of an unsigned current."""
-_CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])"
-_DISCHARGES: Final = r"(?:^|[^a-z])(?:d|dis[a-z]*|dch[a-z]*)(?:$|[^a-z])"
+_CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])|充"
+_DISCHARGES: Final = r"(?:^|[^a-z])(?:d|dis[a-z]*|dch[a-z]*)(?:$|[^a-z])|放"
 _LEAF_SPY: Final = {"Gids", "AHr", "Pack Volts"}
 _LEAF_SPY_SOC: Final = 1e-4
 """LeafSpy writes SoC in ten-thousandths of a percent."""
@@ -214,7 +217,7 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
     places = [
         place
         for place, text in enumerate(headings)
-        if headings.count(text) == 1 and not _STATES.isdisjoint(re.findall("[a-z]+", text.lower()))
+        if headings.count(text) == 1 and _STATES.search(text.lower())
     ]
     for place, column in table.columns(places).items() if places else ():
         cells = pc.fill_null(pc.utf8_lower(present(column)), "")

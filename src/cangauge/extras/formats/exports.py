@@ -309,7 +309,7 @@ READERS: Final = (
         "voltage(v)",
         "step_index",
         set_point=_SIGNED,
-        sensors="auxtemperature.*",
+        sensors="(aux)?temperature.*",
     ),
     _cycler(
         "ESC dynamic test",

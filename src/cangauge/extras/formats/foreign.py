@@ -59,17 +59,28 @@ _FORMATS: Final = (
         "convert it: iconv -f UTF-16 -t UTF-8 FILE > drive.asc",
     ),
     (
-        rb'\{"',
+        rb'\{"[^\n]*\}\r?(\n|$)',
         "JSON, a record a line",
         "make a table of it: pandas.read_json(file, lines=True).to_csv('log.csv', index=False)",
+    ),
+    (
+        rb'\s*(\[\s*)?\{\s*"|\s*\[\s*\[',
+        "JSON",
+        "make a table of it: pandas.read_json(file).to_csv('log.csv', index=False)",
     ),
     (
         rb"\[[\d:.]+\]\[[A-Z]\]\[",
         "a log of ESPHome",
         "read the sensors from the history of Home Assistant or of InfluxDB, as CSV",
     ),
+    (rb"(?i)\s*<(!doctype )?html", "a web page", "download the file itself, not the page about it"),
     (
-        rb"[^\s,=]+(,[^\s,=]+=[^\s,]+)* [^\s=]+=\S+( \d+)?\r?\n",
+        rb"\s*<\?xml",
+        "XML",
+        "make a table of it: pandas.read_xml(file).to_csv('log.csv', index=False)",
+    ),
+    (
+        rb"\w[^\s,=]*(,[^\s,=]+=[^\s,]+)* [^\s=]+=\S+( \d+)?\r?\n",
         "InfluxDB's line protocol",
         "export it from InfluxDB as CSV: influx query --raw, or influx -format csv",
     ),

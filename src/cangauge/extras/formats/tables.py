@@ -126,7 +126,7 @@ class LongTable:
         *("pid", "entity_id", "_measurement", "_field", "field", "name", "signal", "channel"),
         *("sensor", "parameter", "variable", "metric", "topic", "key", "series", "tag"),
     )
-    _VALUES: Final = ("value", "_value", "state")
+    _VALUES: Final = ("value", "_value", "state", "payload", "val")
     _UNITS: Final = frozenset({"unit", "units", "unit_of_measurement"})
 
     def matches(self, head: Head) -> bool:
