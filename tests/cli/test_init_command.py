@@ -107,7 +107,7 @@ def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path
     done = in_process("init", mitsubishi, "-o", tmp_path, *CHOICE)
     assert "1 ?" in done.out
     assert "1 ✓" not in done.out
-    assert "V at 0.1 V a step (about" in done.err
+    assert "V at 0.1 V a step of 16 bits (about" in done.err
     assert "do not tell the scale of the voltage" in done.err
     assert "do not tell the scale of the SoC" in done.err
     assert "% a step (" in done.err  # each with the capacity that follows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -373,6 +374,9 @@ class Model(Fields):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = as_path(path)
+        if not os.path.lexists(path):
+            cure = "`cangauge fit LOG -o MODEL.json` makes one"
+            raise InputError("no such file", source=path, cure=cure)
         data = read_bounded(path, 4 * MIB, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)

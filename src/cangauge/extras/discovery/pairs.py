@@ -126,6 +126,9 @@ class Grid:
         return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
 
 
+NO_LEVEL: Final = Level(1.0, math.nan, "")
+
+
 @dataclass(eq=False)
 class Row:
     """A field as a current or as a voltage.
@@ -139,10 +142,10 @@ class Row:
     missing : array (n,) of bool
     prior : float
         Log prior of the field in its role [nats].
-    scale, volts : float
-        Of a voltage: scale and middle [V].
+    level : Level
+        Scale and value that make it a voltage or a SoC; of a current none is known yet.
     levels : tuple of Level
-        Readings of a voltage that fit the stated one as well as its own, which is the first.
+        Its own, and those of others that fit as well.
     """
 
     field: Field
@@ -150,8 +153,7 @@ class Row:
     constant: int
     missing: BoolArray
     prior: float = 0.0
-    scale: float = 1.0
-    volts: float = math.nan
+    level: Level = NO_LEVEL
     levels: tuple[Level, ...] = ()
 
     @cached_property
@@ -220,6 +222,7 @@ class Row:
             steps=self.steps,
             moves=self.moves,
             not_available=code,
+            levels=self.levels,
             **more,
         )
 
@@ -281,7 +284,7 @@ class Pairs:
         self.r = _product(self._u.values, self._i.values)
         self.slope = np.abs(self.r) * self._u.std[:, None] / np.maximum(self._i.std[None, :], 1e-9)
         evidence = self._likelihood()
-        scale = np.array([row.scale for row in voltages])[:, None]
+        scale = np.array([row.level.scale for row in voltages])[:, None]
         widths = np.array([row.place.width for row in currents])
         away = np.array([row.away for row in currents])
         likely = np.full(self.r.shape, IMPOSSIBLE)
@@ -416,8 +419,8 @@ class Pairs:
             "score": float(self.score[a, b]),
             "evidence": float(self.evidence[a, b]),
             "correlation": r,
-            "resistance_ohm": float(self.slope[a, b]) * u.scale / amps,
-            "halves_ohm": tuple(half * u.scale / amps for half in self._halves(a, b)),
+            "resistance_ohm": float(self.slope[a, b]) * u.level.scale / amps,
+            "halves_ohm": tuple(half * u.level.scale / amps for half in self._halves(a, b)),
         }
         zero = 0.0
         if not i.place.is_signed:
@@ -427,8 +430,7 @@ class Pairs:
         names = [field_name(row.field.stream, row.place) for row in (u, i)]
         sign = 1 if r < 0.0 else -1
         current = i.candidate("current", amps, -amps * zero, sign=sign, partner=names[0], **facts)
-        more = {"levels": u.levels, "partner": names[1]}
-        return current, u.candidate("voltage", u.scale, 0.0, **more, **facts)
+        return current, u.candidate("voltage", u.level.scale, 0.0, partner=names[1], **facts)
 
     def _halves(self, a: int, b: int) -> list[float]:
         """Return dU/dI by each half of the capture, in raw numbers; discharge gives R > 0."""

@@ -7,7 +7,7 @@ what falls with the charge of that current.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from operator import attrgetter
@@ -36,6 +36,7 @@ from cangauge.extras.discovery.pairs import (
     Row,
     round_zeros,
 )
+from cangauge.logs.sign import correlation
 
 VOLTAGE_SCALES: Final = {
     0.1: 0.0,
@@ -190,37 +191,7 @@ def _pair(
     currents = sorted(currents, key=attrgetter("prior"), reverse=True)[:MOST_CURRENTS]
     voltages = sorted(voltages, key=attrgetter("prior"), reverse=True)[:MOST_VOLTAGES]
     current, voltage, row = Pairs(voltages, currents, grid).best()
-    if nominal_v is None:
-        voltage = [_with_levels(each, _voltage_levels(each)) for each in voltage]
     return ([], [], None) if row is None else (current, voltage, row)
-
-
-def _with_levels(one: SignalCandidate, levels: Iterable[Level]) -> SignalCandidate:
-    """Return a candidate with the readings by usual scales, its own first, if there are others."""
-    ordered = sorted(levels)
-    own = [each for each in ordered if each.scale == one.scale]
-    others = [each for each in ordered if each.scale != one.scale]
-    return replace(one, levels=(*own, *others) if others else ())
-
-
-def _voltage_levels(one: SignalCandidate) -> Iterator[Level]:
-    """Yield what usual scales of a voltage mean: bits and physics are the same by every scale."""
-    for scale in VOLTAGE_SCALES:
-        volts = scale * (one.low + one.high) / 2.0 / one.scale
-        text = f"{volts:.3g} V at {scale:g} V a step"
-        if scale == one.scale or 30.0 < volts < 1000.0:
-            cells = round(volts / NOMINAL_CELL_V)
-            yield Level(scale, volts, f"{text} (about {cells} cells)")
-
-
-def _soc_levels(one: SignalCandidate) -> Iterator[Level]:
-    """Yield what usual scales of a SoC mean."""
-    for scale in SOC_SCALES:
-        low, high = (end * scale / one.scale for end in (one.low, one.high))
-        capacity_ah = one.capacity_ah * one.scale / scale
-        if scale == one.scale or (high <= 100.0 and is_capacity(capacity_ah)):
-            ends = f"{low:.3g} … {high:.3g} %"
-            yield Level(scale, high, f"{ends} at {scale:g} % a step ({capacity_ah:.0f} Ah)")
 
 
 def _socs(
@@ -236,9 +207,7 @@ def _socs(
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
     least_ah = LEAST_HOURS * float(np.abs(amps).max())
     found = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
-    possible = [
-        _with_levels(each, _soc_levels(each)) for each in found if each.capacity_ah >= least_ah
-    ]
+    possible = [each for each in found if each.capacity_ah >= least_ah]
     return _apart(possible, current.bits | voltage.bits)
 
 
@@ -289,32 +258,34 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
         prior = nature + _rate_prior(field.stream) + field.statistics.prior
         prior -= AT_HALF_NATS if at_half else 0.0
         for scale in VOLTAGE_SCALES:
-            likely = _scale_prior(scale, level * scale, place.width, nominal_v)
             volts = level * scale
-            readings.append(Row(field, place, constant, missing, prior + likely, scale, volts))
-    return _likeliest(readings, nominal_v)
+            likely = prior + _scale_prior(scale, volts, place.width, nominal_v)
+            text = f"{volts:.3g} V at {scale:g} V a step of {place.width} bits"
+            text += f" (about {round(volts / NOMINAL_CELL_V)} cells)"
+            meant = Level(scale, volts, text)
+            readings.append(Row(field, place, constant, missing, likely, meant))
+    return _likeliest(readings, by_scale=nominal_v is None)
 
 
-def _likeliest(readings: Sequence[Row], nominal_v: float | None) -> Row | None:
-    """Return the likeliest reading, with the others that fit a stated voltage as well."""
+def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
+    """Return the likeliest reading, with the others that fit as well.
+
+    Bits and physics are the same by every scale; where that is decided, other bits of the field may
+    fit as well.
+    """
     best = max(readings, key=attrgetter("prior"), default=None)
     if best is None or best.prior < IMPOSSIBLE / 2.0:
         return None
+    least = IMPOSSIBLE / 2.0 if by_scale else best.prior - UNLIKELY
     others = [
-        _level(row)
-        for row in (readings if nominal_v else ())
-        if abs(math.log(row.volts / (nominal_v or 1.0))) < 2.0 * NOMINAL_SPREAD
-        and abs(row.volts / best.volts - 1.0) > ALIKE
-        and row.prior > best.prior - UNLIKELY
+        each.level
+        for each in readings
+        if each.prior > least
+        and abs(each.level.value / best.level.value - 1.0) > ALIKE
+        and (each.place == best.place or not by_scale)
     ]
-    if others:
-        best.levels = (_level(best), *others)
+    best.levels = (best.level, *sorted(others)) if others else ()
     return best
-
-
-def _level(row: Row) -> Level:
-    text = f"{row.volts:.3g} V at {row.scale:g} V a step of {row.place.width} bits"
-    return Level(row.scale, row.volts, text)
 
 
 def _as_charge(
@@ -326,71 +297,59 @@ def _as_charge(
         return None
     values = grid.means(field.stream, field.raw, field.missing)[span]
     spread, moved = float(np.std(values)), float(np.std(drawn_ah))
-    if spread == 0.0 or moved == 0.0:
-        return None
-    r = float(np.mean((values - values.mean()) * (drawn_ah - drawn_ah.mean()))) / (spread * moved)
+    r = correlation(values, drawn_ah)
     if r > -0.95:
         return None
     evidence = -0.5 * seen.distinct * math.log(1.0 - min(r * r, LARGEST_R2))
-    best: SignalCandidate | None = None
+    readings: list[Row] = []
     for place, nature, constant in field.extents:
-        row = Row(field, place, constant, field.missing)
         for scale in SOC_SCALES:
-            level = (values + constant) * scale
+            low, high = (scale * (end + constant) for end in (values.min(), values.max()))
             capacity_ah = 100.0 * moved / (spread * scale)
-            if not (level.min() > 0.0 and level.max() <= 101.0 and is_capacity(capacity_ah)):
-                continue
-            score = evidence + nature - 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
-            score -= 0.5 if (1 << place.width) * scale > 300.0 and scale > 0.02 else 0.0
-            if best is None or score > best.score:
-                best = row.candidate(
-                    "soc_reference",
-                    scale,
-                    0.0,
-                    score=score,
-                    evidence=evidence,
-                    correlation=r,
-                    partner=f"{capacity_ah:.0f} Ah per 100 %",
-                    capacity_ah=capacity_ah,
-                )
-    return best
+            if low > 0.0 and high <= 101.0 and is_capacity(capacity_ah):
+                score = evidence + nature - 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
+                score -= 0.5 if (1 << place.width) * scale > 300.0 and scale > 0.02 else 0.0
+                text = f"{low:.3g} … {high:.3g} % at {scale:g} % a step ({capacity_ah:.0f} Ah)"
+                meant = Level(scale, high, text)
+                readings.append(Row(field, place, constant, field.missing, score, meant))
+    row = _likeliest(readings, by_scale=True)
+    if row is None:
+        return None
+    capacity_ah = 100.0 * moved / (spread * row.level.scale)
+    return row.candidate(
+        "soc_reference",
+        row.level.scale,
+        0.0,
+        score=row.prior,
+        evidence=evidence,
+        correlation=r,
+        partner=f"{capacity_ah:.0f} Ah per 100 %",
+        capacity_ah=capacity_ah,
+    )
 
 
 def _rate_prior(stream: Stream) -> float:
     """Return the log prior of a period: pack messages are fast, and not in turns."""
     if stream.selector is not None:
         return -2.0
-    if stream.period_s <= 0.11:
-        return 0.8 if stream.period_s <= 0.025 else 0.4
-    return 0.0 if stream.period_s < 0.3 else -1.0
+    return _step(stream.period_s, {0.025: 0.8, 0.11: 0.4, 0.3: 0.0, math.inf: -1.0})
 
 
 def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None) -> float:
-    """Return the log prior of a voltage's scale [nats]: a stated voltage decides it alone."""
+    """Return the log prior of a voltage's scale [nats]: a stated voltage decides it alone.
+
+    Most cars have 250–450 V, and a full scale not far beyond.
+    """
     if nominal_v is not None:
         return max(-0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2, IMPOSSIBLE)
-    return VOLTAGE_SCALES[scale] + _level_prior(volts) + _full_scale_prior(scale, width)
+    level = {30: IMPOSSIBLE, 100: -2.2, 250: -1.5, 450: 0.0, 900: -1.2, math.inf: IMPOSSIBLE}
+    full = {380: -1.0, 1400: 0.0, math.inf: -0.3 if scale <= 0.1 else -2.0}
+    return VOLTAGE_SCALES[scale] + _step(volts, level) + _step(scale * (1 << width), full)
 
 
-def _level_prior(volts: float) -> float:
-    """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
-    if 250.0 <= volts <= 450.0:
-        return 0.0
-    if 450.0 < volts <= 900.0:
-        return -1.2
-    if 100.0 <= volts < 250.0:
-        return -1.5
-    return -2.2 if 30.0 <= volts < 100.0 else IMPOSSIBLE
-
-
-def _full_scale_prior(scale: float, width: int) -> float:
-    """Return the log prior of a voltage's full scale [nats]: not far beyond a pack's voltage."""
-    full = scale * (1 << width)
-    if 380.0 <= full <= 1400.0:
-        return 0.0
-    if full > 1400.0:
-        return -0.3 if scale <= 0.1 else -2.0
-    return -1.0
+def _step(value: float, priors: Mapping[float, float]) -> float:
+    """Return the prior of the first bound that a value does not exceed."""
+    return next(prior for bound, prior in priors.items() if value <= bound)
 
 
 def _apart(found: Candidates, taken: frozenset[tuple[int, bool, int]]) -> Candidates:
