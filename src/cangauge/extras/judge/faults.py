@@ -252,8 +252,10 @@ def _levels(chain: Chain, piece: int) -> Iterator[Column]:
     """Yield a wrong level of one piece, of all from it on, and of all up to it."""
     numbers, last = chain.piece, int(chain.piece.max())
     since = int(chain.blocks.stretch[np.argmax(numbers == piece)])
-    spans = [(piece, piece), (piece, last), (0, piece)]
-    for low, high in spans[: 1 + (piece < last) + (0 < piece < last)]:
+    spans = {(piece, piece), (piece, last)}
+    if piece < last:
+        spans.add((0, piece))
+    for low, high in sorted(spans):
         yield Column(
             "start_or_reset",
             LEVEL_PCT,

@@ -85,6 +85,7 @@ def _now(judgement: Judgement) -> str:
 
 def _past(judgement: Judgement) -> Iterator[str]:
     """Yield what the gauge did before where it was not as it is now, and the causes."""
+    names = [fault.name for fault in judgement.faults]
     most = max(float(np.nanmax(np.r_[-1.0, each])) for each in judgement.published_pct)
     if most > ABOVE_PCT:
         yield f"It published up to {number(most, 1)} %."
@@ -98,7 +99,9 @@ def _past(judgement: Judgement) -> Iterator[str]:
                 f" {number(last.moved_pct, 0)} % of the charge moved."
             )
         else:
-            jump = ", when it set itself" if after.stands_at_pct is None else ""
+            # The SoC by a voltage under load jumps with the load.
+            is_set = after.stands_at_pct is None and "voltage_table" not in names
+            jump = ", when it set itself" if is_set else ""
             yield f"It was {_wrong(last.error_pct, last.std_pct)} until {until}{jump}."
     causes = [_cause(judgement, fault) for fault in judgement.faults if FAULTS[fault.name].words]
     if causes:
