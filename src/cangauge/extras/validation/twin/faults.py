@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -193,15 +194,16 @@ def find_size(
         RMS gap [V].
     pack : TwinPack
     """
-    low, high = np.log(fault.kind.limits(pack))
+    low, high = map(math.log, fault.kind.limits(pack))
     tried: list[tuple[float, float, float]] = []
 
+    @cache  # brentq begins at both ends again
     def excess(log_size: float) -> float:
         """Return the logarithm of gap over target, 0 within the tolerance."""
         size = math.copysign(math.exp(log_size), fault.size)
         gap_v = gap_of(replace(fault, size=size))
         if not math.isfinite(gap_v):
-            return float(high - low)
+            return high - low
         level = math.log(max(gap_v, 1e-9) / target_v)
         tried.append((abs(level), size, gap_v))
         return 0.0 if abs(level) < _TOLERANCE else level

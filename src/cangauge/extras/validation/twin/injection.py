@@ -225,10 +225,12 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> Injected:
     clean = Truth(
         **vars(response), current_a=drive.current_a, core_c=recorded_c, surface_c=recorded_c
     )
-    hot, _ = temperatures(pack, drive, clean.heat_w, present.size("core_temperature"))
-    cool, _ = temperatures(pack, drive, clean.heat_w)
-    current_a = through_cells(drive, present)
-    faulty = respond(pack, drive, present, current_a, recorded_c + (hot - cool))
+    current_a, core_c = through_cells(drive, present), recorded_c
+    if insulation := present.size("core_temperature"):
+        hot, _ = temperatures(pack, drive, clean.heat_w, insulation)
+        cool, _ = temperatures(pack, drive, clean.heat_w)
+        core_c = recorded_c + hot - cool
+    faulty = respond(pack, drive, present, current_a, core_c)
     shift_k = measured_temperature(pack, present, drive, recorded_c) - recorded_c
     expected_v = expected_voltage(pack, drive, present, clean, shift_k)
     voltage_v = measured_voltage(
