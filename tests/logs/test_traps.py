@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -542,3 +543,12 @@ def test_dates_are_read_alike_however_they_are_spelled(tmp_path: Path, stamp: st
     rows = [f"{start + timedelta(seconds=k):{stamp}},{k % 7},360,20" for k in range(ROWS)]
     log = read(tmp_path, "Time,Current [A],Voltage [V],Temp [°C]", rows)
     np.testing.assert_array_equal(log.time_s, start.timestamp() + np.arange(ROWS))
+
+
+def test_infinite_time_is_a_row_without_time(tmp_path: Path) -> None:
+    rows = [f"{'inf' if k == 7 else k},{10 * (k % 2)},{380 - k % 2},21" for k in range(60)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]), encoding="utf-8")
+    with warnings.catch_warnings(action="error"):
+        log = read_log(path)
+    assert len(log) == 59

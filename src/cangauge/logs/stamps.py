@@ -176,6 +176,7 @@ def _seconds_of_numbers(
 ) -> tuple[FloatArray, str]:
     if unit:
         return values * (unit_of("time_s", unit) or (1.0, 0.0))[0], unit
+    values = np.where(np.isfinite(values), values, np.nan)
     finite = values[np.isfinite(values)]
     typical = float(np.median(finite)) if finite.size else 0.0
     first_s, last_s = _CAN_LOGS_S

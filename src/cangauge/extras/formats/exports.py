@@ -131,6 +131,8 @@ class Export:
     def _header(self, head: Head) -> tuple[list[str], int] | None:
         """Return the header, and the number of lines before the data."""
         for number, line in enumerate(head.lines[:40]):
+            if self.delimiter not in line:
+                continue
             header = split_cells(line, self.delimiter)
             lower = [cell.lower() for cell in header]
             if all(any(re.fullmatch(each, cell) for cell in lower) for each in self.known_by):

@@ -6,102 +6,75 @@ current: voltage is interpolated to them, temperature and SoC are held, as for c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
-from cangauge._dataframes import arrow_table
 from cangauge._files import MIB, Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.extras.formats.channels import Channels
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
 
 VOLTAGE_FILL_S: Final = 1.0
 """Longest time between two values of a channel for interpolation [s], as in captures."""
-_TIME: Final = "time [s]"
-"""Heading of the rasters' own time."""
 
 
-class MeasuredChannel(NamedTuple):
-    """Times [s] and values of a channel, shape (n,) each."""
+class _Signals(Channels):
+    """The signals of an open MF4, each on its own raster; `places` are group and index by name."""
 
-    time_s: FloatArray
-    values: FloatArray
+    time = "time [s]"
 
+    def __init__(self, file: Any, places: dict[str, tuple[int, int]], source: Path) -> None:
+        self._file, self._places, self._source = file, places, source
+        self.remarks = []
 
-def _draft_of_channels(
-    head: Head,
-    headings: Sequence[str],
-    given: ColumnMap | None,
-    read: Callable[[list[str]], Mapping[str, MeasuredChannel]],
-) -> DraftLog:
-    """Return the draft of the chosen channels on the raster of the current.
+    @property
+    def headings(self) -> list[str]:
+        """Names and units of the signals."""
+        return [*self._places]
 
-    Parameters
-    ----------
-    head : Head
-    headings : sequence of str
-        `name [unit]` of the channels.
-    given : ColumnMap, optional
-        The user's choice.
-    read : callable
-        Returns channels by heading.
-    """
-    source = str(head.path)
-    names = [_TIME, *(name for name in headings if name != _TIME)]
-    choice = choose_columns(names, (), given)
-    if not choice.is_complete:
-        raise UnknownColumnsError(source, names, choice, given)
-    held = {
-        names[p]
-        for q in ("temperature", "soc")
-        if q in choice.chosen
-        for p in choice.chosen[q].places
-    }
-    current = names[choice.chosen["current"].places[0]]
-    notes: list[str] = []
+    def _signal(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return times [s] and values, none of a signal that holds no numbers."""
+        group, index = self._places[name]
+        signal = self._file.get(group=group, index=index)
+        values = np.asarray(signal.samples)
+        numbers = values.astype(np.float64) if values.dtype.kind in "iufb" else np.empty(0)
+        return np.asarray(signal.timestamps, dtype=np.float64)[: numbers.size], numbers
 
-    def table(wanted: list[str]) -> Any:
-        found = read([name for name in wanted if name != _TIME])
-        time_s = found[current].time_s
-        if not time_s.size:
-            raise InputError("the channel holds no values", source=source, field=current)
-        columns = {_TIME: time_s} if _TIME in wanted else {}
-        for name in wanted:
-            if name != _TIME:
-                columns[name], note = _on_raster(time_s, found[name], name, is_held=name in held)
-                notes.extend([note] if note else [])
-        return arrow_table(columns)
+    def rows_of(self, current: list[str], voltage: list[str]) -> FloatArray:
+        """Return the raster of the current [s]."""
+        del voltage
+        rows_s, _ = self._signal(current[0])
+        if not rows_s.size:
+            problem = "the channel holds no values"
+            raise InputError(problem, source=self._source, field=current[0])
+        return rows_s
 
-    draft = draft_of_table(ArrowTable(names, table), given, name=head.name, source=source)
-    draft.remarks.extend(notes)
-    return draft
-
-
-def _on_raster(
-    time_s: FloatArray, channel: MeasuredChannel, name: str, *, is_held: bool
-) -> tuple[FloatArray, str]:
-    """Return a channel at the times of the current, and a remark on what was done."""
-    if np.array_equal(channel.time_s, time_s):
-        return channel.values, ""
-    known = np.isfinite(channel.values) & np.isfinite(channel.time_s)
-    order = np.argsort(channel.time_s[known], kind="stable")
-    own_s, values = channel.time_s[known][order], channel.values[known][order]
-    if not own_s.size:
-        return np.full(time_s.size, np.nan), f"{name}: the channel holds no values"
-    right = np.searchsorted(own_s, time_s, side="right")
-    if is_held:  # before the first value, the first
-        return values[np.maximum(right - 1, 0)], f"{name}: latest of its {own_s.size} values"
-    filled = np.interp(time_s, own_s, values, left=np.nan, right=np.nan)
-    before = own_s[np.clip(right - 1, 0, own_s.size - 1)]
-    after = own_s[np.clip(right, 0, own_s.size - 1)]
-    filled[(after - before > VOLTAGE_FILL_S) & (before != time_s)] = np.nan
-    return filled, f"{name}: interpolated between its {own_s.size} values"
+    def at(self, name: str, rows_s: FloatArray, quantity: str) -> FloatArray:
+        """Return a signal interpolated between near values; temperature and SoC are held."""
+        time_s, values = self._signal(name)
+        if np.array_equal(time_s, rows_s):
+            return values
+        known = np.isfinite(values) & np.isfinite(time_s)
+        order = np.argsort(time_s[known], kind="stable")
+        own_s, values = time_s[known][order], values[known][order]
+        if not own_s.size:
+            self.remarks.append(f"{name}: the channel holds no values")
+            return np.full(rows_s.size, np.nan)
+        right = np.searchsorted(own_s, rows_s, side="right")
+        if quantity in {"temperature", "soc"}:  # before the first value, the first
+            self.remarks.append(f"{name}: latest of its {own_s.size} values")
+            return values[np.maximum(right - 1, 0)]
+        self.remarks.append(f"{name}: interpolated between its {own_s.size} values")
+        filled = np.interp(rows_s, own_s, values, left=np.nan, right=np.nan)
+        before = own_s[np.clip(right - 1, 0, own_s.size - 1)]
+        after = own_s[np.clip(right, 0, own_s.size - 1)]
+        filled[(after - before > VOLTAGE_FILL_S) & (before != rows_s)] = np.nan
+        return filled
 
 
 class Mf4Signals:
@@ -140,11 +113,7 @@ class Mf4Signals:
         try:
             with head.open() as unpacked, MDF(unpacked) as file:
                 places = self._places(file)
-
-                def read(names: list[str]) -> dict[str, MeasuredChannel]:
-                    return {name: _signal(file, *places[name]) for name in names}
-
-                draft = _draft_of_channels(head, list(places), columns, read)
+                draft = _Signals(file, places, head.path).draft(head, columns)
         except InputError:
             raise
         except Exception as error:  # asammdf raises whatever a damaged block provokes
@@ -172,13 +141,6 @@ class Mf4Signals:
                 if count > counts.get(heading, 0):
                     places[heading], counts[heading] = (number, index), count
         return places
-
-
-def _signal(file: Any, group: int, index: int) -> MeasuredChannel:
-    signal = file.get(group=group, index=index)
-    values = np.asarray(signal.samples)
-    numbers = values.astype(np.float64) if values.dtype.kind in "iufb" else np.empty(0)
-    return MeasuredChannel(np.asarray(signal.timestamps, dtype=np.float64)[: numbers.size], numbers)
 
 
 READERS: Final = (Mf4Signals(),)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import islice
 from operator import itemgetter
 from typing import Any, Final
@@ -15,14 +14,14 @@ import pyarrow.compute as pc
 from cangauge._files import Head
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.extras.formats.channels import DRIVING, Channels
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import UnknownColumnsError, choose_columns
+from cangauge.logs.columns import choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.gaps import BRIDGE_S, usual_step_s
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.read import LogTableReader
 from cangauge.logs.stamps import over_midnight, seconds_of
-from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_ROWS, TextTable, headed
 from cangauge.logs.values import is_text
 
@@ -33,8 +32,6 @@ POLLED_SHARE: Final = 0.1
 """Share of values that repeat the one before from which they are polled, not stored on change [-]:
 of many series some, such as the temperature, hardly move."""
 DAY_S: Final = 86_400.0
-_TIME: Final = "time"
-"""Heading of the rows' time."""
 
 
 class Workbook:
@@ -139,38 +136,11 @@ class LongTable:
         if text is None:
             raise InputError("no header with a name, a value and a time", source=head.path)
         series = self._series(text)
-        headings = [_TIME, *series.headings]
-        choice = choose_columns(headings, (), columns)
-        if not choice.is_complete:
-            raise UnknownColumnsError(str(head.path), headings, choice, columns)
-        current, voltage = (
-            [headings[place] for place in choice.chosen[quantity].places]
-            for quantity in ("current", "voltage")
-        )
-        rows_s = series.stamps_of(current)
-        if not series.is_polled:
-            rows_s = series.rows_of([*current, *voltage])
-
-        def read(wanted: list[str]) -> Any:
-            at_rows = series.nearest if series.is_polled else series.latest
-            table = {}
-            for name in wanted:
-                is_driving = name in current or name in voltage
-                table[name] = rows_s
-                if name != _TIME:
-                    table[name] = at_rows(name, rows_s, is_driving=is_driving)
-            return pa.table(table)
-
-        draft = draft_of_table(
-            ArrowTable(headings, read), columns, name=head.name, source=str(head.path)
-        )
+        draft = series.draft(head, columns)
         known = np.isfinite(draft.values["current_a"] + draft.values["voltage_v"])
         draft.values = {name: values[known] for name, values in draft.values.items()}
-        draft.assumed[0] = f'time = "{series.time}" [{series.how}]'
-        draft.labels["time_s"] = series.time
-        each = "the current" if series.is_polled else "current and voltage, which are held"
-        pivoted = f"{len(series.headings)} series of {series.name} pivoted on time"
-        draft.remarks.append(f"a row per value: {pivoted}; a row for each value of {each}")
+        draft.assumed[0] = f'time = "{series.label}" [{series.how}]'
+        draft.labels["time_s"] = series.label
         return draft
 
     def _text(self, head: Head) -> TextTable | None:
@@ -229,36 +199,39 @@ def _by_name(
     return {name: part for name, part in named if name and np.isfinite(part[1]).any()}
 
 
-@dataclass(frozen=True, slots=True)
-class _Series:
+class _Series(Channels):
     """Times [s] and values of each series of a long table, in the order of time.
 
-    `name` and `time` are the headings of the names and the times, `how` tells how times are read.
+    `label` is the heading of the times, `how` tells how times are read, `names` is the heading of
+    the series' names.
     """
 
-    name: str
-    time: str
-    how: str
-    by_name: dict[str, tuple[FloatArray, FloatArray]]
+    time = "time"
+
+    def __init__(
+        self, names: str, label: str, how: str, by_name: dict[str, tuple[FloatArray, FloatArray]]
+    ) -> None:
+        self.label, self.how, self._by_name = label, how, by_name
+        repeats = [np.diff(values) == 0.0 for _, values in by_name.values()]
+        self._is_polled = bool(np.mean(np.concatenate(repeats)) > POLLED_SHARE)
+        each = "the current" if self._is_polled else "current and voltage, which are held"
+        pivoted = f"{len(by_name)} series of {names} pivoted on time"
+        self.remarks = [f"a row per value: {pivoted}; a row for each value of {each}"]
 
     @property
     def headings(self) -> list[str]:
         """The names of the series."""
-        return [*self.by_name]
+        return [*self._by_name]
 
-    @property
-    def is_polled(self) -> bool:
-        """Whether values are stored whether or not they changed."""
-        repeats = [np.diff(values) == 0.0 for _, values in self.by_name.values()]
-        return bool(np.mean(np.concatenate(repeats)) > POLLED_SHARE)
-
-    def stamps_of(self, names: Sequence[str]) -> FloatArray:
+    def _stamps_of(self, names: Sequence[str]) -> FloatArray:
         """Return the times of all values of some series [s]."""
-        return np.unique(np.concatenate([self.by_name[name][0] for name in names]))
+        return np.unique(np.concatenate([self._by_name[name][0] for name in names]))
 
-    def rows_of(self, names: Sequence[str]) -> FloatArray:
-        """Return the times of all values of some series [s], and as many between as are usual."""
-        stamps_s = self.stamps_of(names)
+    def rows_of(self, current: list[str], voltage: list[str]) -> FloatArray:
+        """Return the times of polled currents, or of all changes and usual ones between."""
+        if self._is_polled:
+            return self._stamps_of(current)
+        stamps_s = self._stamps_of([*current, *voltage])
         step_s = max(usual_step_s(stamps_s), 1.0)
         more = np.maximum(np.ceil(np.diff(stamps_s) / step_s).astype(int) - 1, 0)
         more[np.diff(self._session(stamps_s)) > 0] = 0
@@ -267,16 +240,21 @@ class _Series:
 
     def _session(self, at_s: FloatArray) -> IntArray:
         """Return by time the number of silences of all series before it."""
-        all_s = self.stamps_of(self.headings)
+        all_s = self._stamps_of(self.headings)
         ends_s = all_s[1:][np.diff(all_s) > HELD_S]
         return np.searchsorted(ends_s, at_s, side="right")
 
-    def latest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
+    def at(self, name: str, rows_s: FloatArray, quantity: str) -> FloatArray:
+        """Return the nearest values of polled series, the latest of others."""
+        at_rows = self._nearest if self._is_polled else self._latest
+        return at_rows(name, rows_s, is_driving=quantity in DRIVING)
+
+    def _latest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
         """Return the latest value at some times; of current and voltage only those that hold.
 
         Of others the first value also holds before it.
         """
-        stamps_s, values = self.by_name[name]
+        stamps_s, values = self._by_name[name]
         if not is_driving:
             known = np.isfinite(values)
             stamps_s, values = stamps_s[known], values[known]
@@ -284,9 +262,9 @@ class _Series:
         holds = (at_s >= stamps_s[place]) & (self._session(at_s) == self._session(stamps_s)[place])
         return values[place] if not is_driving else np.where(holds, values[place], np.nan)
 
-    def nearest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
+    def _nearest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
         """Return the value nearest to some times; of current and voltage only if it is near."""
-        stamps_s, values = self.by_name[name]
+        stamps_s, values = self._by_name[name]
         after = np.clip(np.searchsorted(stamps_s, at_s), 0, stamps_s.size - 1)
         before = np.maximum(after - 1, 0)
         is_before = np.abs(at_s - stamps_s[before]) <= np.abs(stamps_s[after] - at_s)
