@@ -435,12 +435,11 @@ class Pairs:
     def _halves(self, a: int, b: int) -> list[float]:
         """Return dU/dI by each half of the capture, in raw numbers; discharge gives R > 0."""
         half, found = self._rows // 2, []
+        scale = float(self._u.std[a] / self._i.std[b])
         for part in (slice(0, half), slice(half, None)):
-            u = self._u.values[a, part].astype(np.float64)
-            i = self._i.values[b, part].astype(np.float64)
-            power = float(np.var(i))
-            both = float(np.mean((u - u.mean()) * (i - i.mean())))
-            ratio = both / power * float(self._u.std[a] / self._i.std[b]) if power else math.nan
+            moves = self._u.values[a, part], self._i.values[b, part]
+            (_, both), (_, power) = np.cov(*moves, dtype=np.float64)
+            ratio = float(both / power) * scale if power else math.nan
             found.append(-ratio if self.r[a, b] < 0.0 else ratio)
         return found
 
