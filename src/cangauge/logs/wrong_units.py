@@ -262,6 +262,9 @@ def _wrong_temperature(temperature: FloatArray, *, may_be_swapped: bool) -> Iter
         also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
         units = ["K"] if np.any(temperature % 1.0) else ["K", "0.1°C"]
         yield typical, "temperature looks like kelvin", f"subtract 273.15{also}", units
+    if HOTTEST_C < typical / 10.0 <= 100.0 * HOTTEST_C:
+        problem = "temperature looks like thousandths of a degree"
+        yield typical, problem, "divide it by 1000", ["0.001°C"]
     if not COLDEST_C <= typical <= HOTTEST_C:
         yield typical, "this is not a battery's temperature in °C", "convert it to °C", []
     odd = (temperature < COLDEST_C) | (temperature > HOTTEST_C)
