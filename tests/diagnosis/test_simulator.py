@@ -58,6 +58,18 @@ def test_a_corrected_simulator_is_better(logs: list[Log], model: Model) -> None:
         assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
 
 
+def test_a_simulator_that_misses_references_is_not_fitted_again(
+    logs: list[Log], model: Model
+) -> None:
+    references = [day(seed) for seed in (33, 34, 35)]
+    found = diagnose(logs, model, references, simulation=Simulator(volts=6.0))
+    check = found.model_check
+    assert check is not None
+    assert not check.describes
+    assert "The simulator misses the healthy logs by" in found.summary
+    assert "Fit the model again" not in found.summary
+
+
 def test_the_gap_is_the_difference_to_the_simulator(logs: list[Log], model: Model) -> None:
     found = diagnose(logs, model, simulation=Simulator(volts=0.8))
     difference = np.concatenate([log.voltage_v - Simulator(0.8)(

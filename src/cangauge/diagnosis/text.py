@@ -66,10 +66,13 @@ def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     what = "none of the nine faults explains it"
     if missed:
         what = f"to it they look as if {'; '.join(missed)}"
-    lines = [f"The model misses the healthy logs by {size}: {what}."]
+    name = "model" if found.simulator is None else "simulator"
+    lines = [f"The {name} misses the healthy logs by {size}: {what}."]
     if check.missed:
         after = volts(check.missed[-1].rmse_v)
         lines.append(f"Error {volts(check.references_rmse_v)} → {after} with this corrected.")
+    if found.simulator is not None:
+        return [*lines, "Correct the simulator on healthy logs first."]
     path = found.correction_path
     better = f", or take {path}" if path else ""
     lines.append(f"Fit the model again on healthy logs{better}.")

@@ -105,10 +105,12 @@ def closed_part(
 def excesses(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, Any]]:
     """Return the error of the given model in each interval of each axis, over that of all rows.
 
-    `excess` is a ratio of RMS errors, `ci` its 95 % interval.
+    `excess` is a ratio of RMS errors, `ci` its 95 % interval. None where there is no error at all.
     """
     piece = pieces(logs)
     square = np.concatenate([log.before_v for log in logs]) ** 2
+    if not square.any():
+        return []
     every = np.ones(square.size)
     found = []
     for axis, unit, values, edges in _axes(logs, capacity_ah):
@@ -119,7 +121,7 @@ def excesses(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, An
             part, rows, whole, all_rows = drawn_sums(
                 piece, square * inside, inside.astype(np.float64), square, every
             )
-            usable = rows > 0.0
+            usable = (rows > 0.0) & (whole > 0.0)
             ratios = np.sqrt(part[usable] / rows[usable] * all_rows[usable] / whole[usable])
             mean = float(square[inside].mean())
             found.append(

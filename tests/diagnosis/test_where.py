@@ -1,0 +1,26 @@
+"""Where the error of a log lies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cangauge.diagnosis.where import LogErrors, excesses
+
+
+def errors_v(rows: int, wrong: int) -> LogErrors:
+    """Return a log of one row a second whose last `wrong` rows alone are off."""
+    time_s = np.arange(float(rows))
+    before_v = np.where(time_s >= rows - wrong, 1.0, 0.0)
+    soc_pct = np.linspace(90.0, 30.0, rows)
+    current_a = np.full(rows, 20.0)
+    return LogErrors("log", time_s, current_a, np.full(rows, 20.0), soc_pct, before_v, before_v)
+
+
+@pytest.mark.parametrize("wrong", [0, 200, 3600])
+@pytest.mark.filterwarnings("error")
+def test_a_log_without_error_in_most_pieces_has_finite_intervals(wrong: int) -> None:
+    found = excesses([errors_v(3600, wrong)], 60.0)
+    assert bool(found) is (wrong > 0)
+    for place in found:
+        assert np.all(np.isfinite([place["excess"], *place["ci"]]))
