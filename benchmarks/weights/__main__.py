@@ -59,7 +59,6 @@ def main() -> int:
             pack: sum(x.pack == pack for x in examples)
             for pack in sorted({x.pack for x in examples})
         },
-        "held_out": table.splitlines(),
     }
     SHIPPED.write_text(json.dumps(whole, indent=1, ensure_ascii=False) + "\n")
     print(f"Every data set held out in turn:\n{table}\nwrote {SHIPPED}: {weights}")

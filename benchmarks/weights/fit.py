@@ -13,9 +13,9 @@ from scipy.special import logsumexp
 from cangauge.diagnosis.posterior import FAULTS, NONE, UNKNOWN, Features, probabilities
 from cangauge.model.effects.library import LIBRARY
 
-CENTRE = np.array([0.7, 0.6, 1.5, 0.5, *[0.0] * 11])
-SPREAD = np.array([1.0, 1.0, 1.0, 0.5, 3.0, *[3.0, 1.0, 1.0, 1.0, 3.0] * 2])
-"""Ridge: prior mean and deviation of the two inner weights, the exponent, slope and offset of the
+CENTRE = np.array([0.7, 0.6, 0.5, 1.5, 0.5, *[0.0] * 11])
+SPREAD = np.array([1.0, 1.0, 1.0, 1.0, 0.5, 3.0, *[3.0, 1.0, 1.0, 1.0, 3.0] * 2])
+"""Ridge: prior mean and deviation of the three inner weights, the exponent, slope and offset of the
 library, and the outer weights of none and unknown."""
 
 
@@ -73,11 +73,11 @@ def fit(examples: Sequence[Example]) -> dict[str, Any]:
         return 0.5 * float(np.sum(((v - CENTRE[part]) / SPREAD[part]) ** 2))
 
     def fault_loss(v: np.ndarray) -> float:
-        u = v[2] * _values(few, v[:2])
+        u = v[3] * _values(few, v[:3])
         loss = u[np.arange(at.size), at] - logsumexp(u, axis=1)
         return -float(weight[known] @ loss) + ridge(v, 0)
 
-    *inner, exponent = minimize(fault_loss, CENTRE[:3], method="L-BFGS-B").x
+    *inner, exponent = minimize(fault_loss, CENTRE[:4], method="L-BFGS-B").x
     library = logsumexp(exponent * _values(examples, np.array(inner)), axis=1)
     outer = np.array([x.features.outer for x in examples])
     kind = np.array([0 if k else 1 if fault == NONE else 2
@@ -86,9 +86,9 @@ def fit(examples: Sequence[Example]) -> dict[str, Any]:
     def outer_loss(v: np.ndarray) -> float:
         z = np.column_stack([v[0] * library + v[1], outer @ v[2:7], outer @ v[7:]])
         loss = z[np.arange(kind.size), kind] - logsumexp(z, axis=1)
-        return -float(weight @ loss) + ridge(v, 3)
+        return -float(weight @ loss) + ridge(v, 4)
 
-    found = minimize(outer_loss, CENTRE[3:], method="L-BFGS-B").x.round(4).tolist()
+    found = minimize(outer_loss, CENTRE[4:], method="L-BFGS-B").x.round(4).tolist()
     return {
         "inner": np.round(inner, 4).tolist(),
         "exponent": round(float(exponent), 4),

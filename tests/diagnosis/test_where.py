@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.where import LogErrors, excesses
+from cangauge.diagnosis.where import LogErrors, closed_part, excesses
 
 
 def errors_v(rows: int, wrong: int) -> LogErrors:
@@ -24,3 +24,17 @@ def test_a_log_without_error_in_most_pieces_has_finite_intervals(wrong: int) -> 
     assert bool(found) is (wrong > 0)
     for place in found:
         assert np.all(np.isfinite([place["excess"], *place["ci"]]))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_drawn_piece_without_rows_costs_the_closed_part_nothing() -> None:
+    """Of two stretches an hour apart, most pieces between hold no row."""
+    whole = errors_v(3900, 300)
+    kept = np.r_[0:300, 3600:3900]
+    parts = {
+        name: getattr(whole, name)[kept]
+        for name in ("time_s", "current_a", "temperature_c", "soc_pct", "before_v")
+    }
+    closed, _ = closed_part([LogErrors("log", **parts, after_v=0.5 * parts["before_v"])], 0.1)
+    assert closed is not None
+    assert 0.7 < closed < 1.0

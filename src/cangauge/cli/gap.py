@@ -174,9 +174,11 @@ def gap_command(
         if added:
             before = diagnose(found.logs[: len(logs)], found.model, found.healthy, alarm=alarm)
     texts = {}
-    if extended is not None and found.is_written:
-        texts[extended] = found.extended_model.to_json()
+    if extended is not None:
+        # Before anything is computed: a copy knows nothing of what its original computed.
         found = replace(found, correction_path=str(extended))
+        if found.is_written:
+            texts[extended] = found.extended_model.to_json()
     if report is not None:
         texts[report] = extra("report.diagnosis:gap_page")(found, model).html()
     write_texts_atomic(texts)
@@ -286,5 +288,5 @@ def _show(found: Diagnosis, before: Diagnosis | None, plan: bool, written: Itera
     say("\n- ".join(["What limits this answer:", *found.caveats]))
     for path in written:
         note(f"wrote {path}")
-    if found.correction_path is None and not found.is_written:
+    if not found.is_written:
         note(f"no corrected model: {found.why_not}")

@@ -1,13 +1,16 @@
 """One calibrated posterior of `none`, `unknown` and nine faults.
 
-    u_k = w₁·ln(1 + n_k/o_k) − w₂·ln(1 + V_k/v)
+    u_k = w₁·ln(1 + n_k/o_k) − w₂·ln(1 + V_k/v) − w₃·ln(1 + (n_max − n_k)/o_k)
     P(fault | gap) ∝ (mean over its effects of e^u_k)^γ
 
-with n_k/o_k the evidence of effect k over what healthy logs show of it, and V_k the mean square
-error that it leaves, v that of a healthy log. The faults compete with
-each other, and together with `none` and `unknown` (nested logit: Train, Discrete Choice Methods
-with Simulation, 2nd ed., 2009, ch. 4). w, γ and the weights of the outer features are fitted to
-labelled cases with packs held out (`benchmarks/weights`).
+with n_k/o_k the evidence of effect k over what healthy logs show of it, V_k the mean square error
+that it leaves, v that of a healthy log, and n_max the largest evidence of any effect. The first two
+say little between the effects of a large fault, which all explain much of it; the third is what
+they lack.
+
+The faults compete with each other, and together with `none` and `unknown` (nested logit: Train,
+Discrete Choice Methods with Simulation, 2nd ed., 2009, ch. 4). w, γ and the weights of the outer
+features are fitted to labelled cases with packs held out (`benchmarks/weights`).
 """
 
 from __future__ import annotations
@@ -59,26 +62,29 @@ class Features:
 
     Parameters
     ----------
-    effects : dict of str to (float, float)
-        ln(1 + n_k/o_k) and −ln(1 + V_k/v) of each effect.
+    effects : dict of str to (float, float, float)
+        ln(1 + n_k/o_k), −ln(1 + V_k/v) and −ln(1 + (n_max − n_k)/o_k) of each effect.
     outer : array
         ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, ln(V/v), 1; V is
         the mean square error, and v that of a healthy log at these SoC and temperatures.
     """
 
-    effects: dict[str, tuple[float, float]]
+    effects: dict[str, tuple[float, float, float]]
     outer: FloatArray
 
 
 def features(healthy: Healthy, evidence: Evidence) -> Features:
     """Return what the posterior sees of a case."""
     v = healthy.healthy_v2 + max(evidence.open_v2 - healthy.known_v2, 0.0)
-    effects = {
-        name: (math.log1p(max(e.nats, 0.0)), -math.log1p(e.left_v2 / v))
-        for name, e in evidence.effects.items()
-    }
-    best = max(effects, key=lambda name: sum(effects[name]))
-    most = max(gain for gain, _ in effects.values())
+    excess = {name: healthy.excess_of(name) for name in evidence.effects}
+    n_max = max(max(e.nats, 0.0) * excess[name] for name, e in evidence.effects.items())
+    effects = {}
+    for name, e in evidence.effects.items():
+        nats = max(e.nats, 0.0)
+        lacking = n_max / excess[name] - nats
+        effects[name] = (math.log1p(nats), -math.log1p(e.left_v2 / v), -math.log1p(lacking))
+    best = max(effects, key=lambda name: sum(effects[name][:2]))
+    most = max(each[0] for each in effects.values())
     usual = float(np.mean(np.log1p(healthy.nats))) if healthy.nats else math.log1p(UNTESTED)
     gap = math.log(evidence.gap_v2 / v) - (0.0 if healthy.nats else 2.0 * math.log(UNTESTED))
     left = math.log(evidence.effects[best].left_v2 / v + 0.1)

@@ -74,7 +74,7 @@ def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     if found.simulator is not None:
         return [*lines, "Correct the simulator on healthy logs first."]
     path = found.correction_path
-    better = f", or take {path}" if path else ""
+    better = f", or take {path}" if path and found.is_written else ""
     lines.append(f"Fit the model again on healthy logs{better}.")
     return lines
 

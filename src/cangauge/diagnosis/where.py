@@ -93,11 +93,11 @@ def closed_part(
     closed = min(float((before.mean() - after.mean()) / gap), 1.0)
     sums = drawn_sums(pieces(logs), before, after, np.ones(before.size))
     drawn_before, drawn_after, rows = sums
-    gaps = drawn_before / rows - healthy_v2
+    gaps = drawn_before - healthy_v2 * rows
     usable = gaps > 0.0
     if usable.mean() < 0.9:
         return closed, None
-    parts = np.minimum(((drawn_before - drawn_after) / rows)[usable] / gaps[usable], 1.0)
+    parts = np.minimum((drawn_before - drawn_after)[usable] / gaps[usable], 1.0)
     low, high = np.quantile(parts, [0.025, 0.975])
     return closed, (float(low), float(high))
 
