@@ -76,13 +76,16 @@ def _content(table: Table) -> dict[str, Any]:
 
 def _command(given: Sequence[str]) -> str:
     """Return a command line as a reader would type it, without the folder of the data."""
-    path = Path(given[0]).resolve().relative_to(ROOT)
-    script = f"python {path}"
-    if path.name == "__main__.py":
-        script = f"cd benchmarks && python -m {path.parent.name}"
+    module = sys.modules["__main__"].__spec__
+    if module is None:
+        script = f"python {Path(given[0]).resolve().relative_to(ROOT)}"
+    elif "." in module.parent:
+        script = f"python -m {module.parent}"
+    else:
+        script = f"cd benchmarks && python -m {module.parent}"
     arguments = [each for each in given[1:] if each != "--keep"]
     for place, each in enumerate(arguments[:-1]):
-        if each == "--data":
+        if each in {"--data", "--cases"}:
             arguments[place + 1] = "FOLDER"
     return " ".join([script, *arguments])
 

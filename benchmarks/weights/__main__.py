@@ -18,10 +18,13 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+from benchmarks.figures import publish
 from benchmarks.weights import cases, fit, score, user
+from rich.table import Table
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = ROOT / "src/cangauge/diagnosis/weights.json"
+DESCRIBES = ("src/cangauge/diagnosis", "src/cangauge/model", "src/cangauge/identify")
 SEEDS = {"weights": 11, "frozen": 20261129}
 
 
@@ -33,26 +36,30 @@ def main() -> int:
     parser.add_argument("command", choices=["fit", "check", "models", "trips"])
     parser.add_argument("--data", type=Path, default=ROOT / "../shared/data")
     parser.add_argument("--cases", type=Path, default=ROOT / "out/weights")
+    parser.add_argument("--keep", action="store_true", help="keep the figures of docs/results.md")
     parser.add_argument("--every", type=int, default=1, help="score every N-th split only")
     given = parser.parse_args()
     if given.command == "models":
-        print(user.models(given.data))
-        return 0
-    if given.command == "trips":
-        print(user.trips(given.data))
-        return 0
+        tables = [user.models(given.data)]
+    elif given.command == "trips":
+        tables = [user.trips(given.data)]
+    else:
+        tables = _scored(given)
+    publish(f"weights-{given.command}", tables, DESCRIBES, keeps=given.keep)
+    return 0
+
+
+def _scored(given: argparse.Namespace) -> list[Table]:
+    """Draw and diagnose the cases of a part; write the weights fitted to those for weights."""
     part = "weights" if given.command == "fit" else "frozen"
     folder = given.cases / part
     cases.plan(part, given.data, folder, SEEDS[part], score.floor_v)
     examples = score.examples(folder, given.every)
     if part == "frozen":
-        print(score.table(examples, [x.found["probabilities"] for x in examples]))
-        return 0
+        return score.tables(examples, [x.found["probabilities"] for x in examples])
     found = fit.held_out(examples)
-    stated, table = score.stated_from(examples, found), score.table(examples, found)
-    weights = fit.fit(examples) | {"stated": stated}
     whole = {
-        "weights": weights,
+        "weights": fit.fit(examples) | {"stated": score.stated_from(examples, found)},
         "command": "python -m benchmarks.weights fit",
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "cases": {
@@ -61,8 +68,7 @@ def main() -> int:
         },
     }
     SHIPPED.write_text(json.dumps(whole, indent=1, ensure_ascii=False) + "\n")
-    print(f"Every data set held out in turn:\n{table}\nwrote {SHIPPED}: {weights}")
-    return 0
+    return score.tables(examples, found)
 
 
 if __name__ == "__main__":

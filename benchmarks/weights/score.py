@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.weights.cases import Split
 from benchmarks.weights.fit import Example
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
@@ -106,12 +107,11 @@ def stated_from(examples: Sequence[Example], found: Sequence[dict[str, float]]) 
     return round(float(np.array(within)[order][enough[-1]]), 2) if enough.size else 0.9
 
 
-def table(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> str:
-    """Return the table of all scores."""
+def tables(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> list[Table]:
+    """Return the scores of cases with a fault, by groups, and those of all cases."""
     stated = stated_level()
     rows = [(x, Posterior(p, ALARM, stated)) for x, p in zip(examples, found, strict=True)]
     known = [(x, p) for x, p in rows if x.truth["fault"] in FAULTS]
-    lines = ["cases of the nine faults         n first in two stated right gap likely"]
     groups: list[tuple[str, Callable[[Example], bool]]] = [
         ("one floor or more, recorded", lambda x: x.floors >= 1 and x.world != "simulated"),
         ("one floor or more, simulated", lambda x: x.floors >= 1 and x.world == "simulated"),
@@ -122,15 +122,23 @@ def table(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> str
         ("one floor or more, 2 to 6 logs", lambda x: x.floors >= 1 and x.logs > 1),
     ]
     packs = sorted({x.pack for x, _ in known})
-    groups += [(f"  {k}", lambda x, k=k: x.floors >= 1 and x.pack == k) for k in packs]  # type: ignore[misc]
-    for label, inside in groups:
-        lines.append(f"{label:30s} {_line([(x, p) for x, p in known if inside(x)])}")
-    healthy = [p for x, p in rows if x.truth["fault"] == NONE]
-    lines.append(
-        f"healthy: {len(healthy)}, gap {sum(p.level == 'gap' for p in healthy)}, likely"
-        f" {sum(p.level == 'likely' for p in healthy)}"
+    groups += [
+        (f"one floor or more, {k}", lambda x, k=k: x.floors >= 1 and x.pack == k)  # type: ignore[misc]
+        for k in packs
+    ]
+    by_group = Table(
+        "faults", "cases", "right first", "in two", "one stated", "right", "gap", "gap or likely"
     )
-    return "\n".join([*lines, _calibration(rows), *_corrections(rows)])
+    for label, inside in groups:
+        by_group.add_row(label, *_scores([(x, p) for x, p in known if inside(x)]))
+    whole = Table("measure", "value")
+    healthy = [p.level for x, p in rows if x.truth["fault"] == NONE]
+    whole.add_row("healthy: gap", f"{healthy.count('gap')} of {len(healthy)}")
+    whole.add_row("healthy: likely", f"{healthy.count('likely')} of {len(healthy)}")
+    whole.add_row("P(fault) → frequency (cases)", _calibration(rows))
+    for measure, value in _corrections(rows):
+        whole.add_row(measure, value)
+    return [by_group, whole]
 
 
 def stated_level() -> float:
@@ -138,19 +146,24 @@ def stated_level() -> float:
     return float(shipped_weights()["stated"])
 
 
-def _line(rows: Sequence[tuple[Example, Posterior]]) -> str:
+def _scores(rows: Sequence[tuple[Example, Posterior]]) -> list[str]:
     if not rows:
-        return "   0"
+        return ["0"]
     first = [next(iter(p.faults)) == x.truth["fault"] for x, p in rows]
     two = [x.truth["fault"] in list(p.faults)[:2] for x, p in rows]
     one = np.array([len(p.stated) == 1 for _, p in rows])
     right = np.array(first)[one]
     gap = [p.level == "gap" for _, p in rows]
     likely = [p.level != "none" for _, p in rows]
-    return (
-        f"{len(rows):4d} {np.mean(first):.2f} {np.mean(two):.2f} {one.mean():.2f}"
-        f" {right.sum()}/{right.size} {np.mean(gap):.2f} {np.mean(likely):.2f}"
-    )
+    return [
+        str(len(rows)),
+        f"{np.mean(first):.2f}",
+        f"{np.mean(two):.2f}",
+        f"{one.mean():.2f}",
+        f"{right.sum()} of {right.size}",
+        f"{np.mean(gap):.2f}",
+        f"{np.mean(likely):.2f}",
+    ]
 
 
 def _calibration(rows: Sequence[tuple[Example, Posterior]]) -> str:
@@ -166,17 +179,18 @@ def _calibration(rows: Sequence[tuple[Example, Posterior]]) -> str:
         if kept:
             mean, share = np.mean(kept, axis=0)
             parts.append(f"{mean:.2f} → {share:.2f} ({len(kept)})")
-    return "P(fault) → frequency (cases): " + ", ".join(parts)
+    return ", ".join(parts)
 
 
-def _corrections(rows: Sequence[tuple[Example, Posterior]]) -> list[str]:
+def _corrections(rows: Sequence[tuple[Example, Posterior]]) -> list[tuple[str, str]]:
     told = [x for x, p in rows if p.level != "none" and x.truth["fault"] in FAULTS]
     offered = [x for x in told if x.found["accepted"]]
     closed = [x.found["closed"] for x in offered if x.found["closed"] is not None]
     covers = [x.found["covers"] for x, _ in rows if x.found["covers"] is not None]
     worse = sum(not x.found["better"] for x in offered)
     return [
-        f"correction offered: {len(offered)} of {len(told)}; closes {np.median(closed):.2f}"
-        f" (median) of the squared gap, worse in {worse}",
-        f"95 % intervals hold the size: {np.mean(covers):.2f} ({len(covers)})",
+        ("correction offered, of gap or likely", f"{len(offered)} of {len(told)}"),
+        ("squared gap that it closes (median)", f"{np.median(closed):.2f}"),
+        ("corrections that are worse", str(worse)),
+        ("95 % intervals that hold the size", f"{np.mean(covers):.2f} of {len(covers)}"),
     ]

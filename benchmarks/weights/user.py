@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.weights import packs
+from rich.table import Table
 
 from cangauge.bus.recording import read_log
-from cangauge.diagnosis import diagnose, learn_references
+from cangauge.diagnosis import Diagnosis, diagnose, learn_references
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -59,27 +60,32 @@ def _trip(data: Path, number: int) -> Log:
     return read_log(data / "bmw_i3" / f"TripA{number:02d}.csv.gz")
 
 
-def trips(data: Path) -> str:
-    """Return the answers of two trips with six and with twelve references, as printed."""
+def trips(data: Path) -> Table:
+    """Return what is stated of two trips with six and with twelve references."""
     every = [_trip(data, number) for number in REFERENCES]
-    lines = []
+    columns = {}
     for count in (6, 12):
-        references, right, wrong = every[:count], 0, 0
+        references = every[:count]
         model = fit(references, capacity_ah=packs.I3_AH).model
         healthy = learn_references(references, model)
-        for name, (fault, change) in CELLS.items():
+        for name, (_, change) in CELLS.items():
             logs = [change(_trip(data, number), model) for number in LOGS]
-            found = diagnose(logs, model, healthy)
-            stated = found.posterior.stated
-            right += stated == (fault,)
-            wrong += len(stated) == 1 and stated != (fault,)
-            mark = "right" if stated == (fault,) else "wrong" if len(stated) == 1 else "two or none"
-            lines += [f"-- {count} references, {name} ({mark})", found.summary, ""]
-        lines += [
-            f"{count} references: stated and right {right} of {len(CELLS)}, wrong {wrong}",
-            "",
-        ]
-    return "\n".join(lines)
+            columns[name, count] = diagnose(logs, model, healthy)
+    table = Table("done to both trips", "6 references", "12 references")
+    for name, (fault, _) in CELLS.items():
+        table.add_row(name, *(_said(columns[name, count], fault) for count in (6, 12)))
+    return table
+
+
+def _said(found: Diagnosis, fault: str) -> str:
+    """Return the faults stated with their probability, and whether one is right."""
+    stated, p = found.posterior.stated, found.posterior.faults
+    if not stated:
+        return f"none (P(no fault) {found.posterior.none:.0%})"
+    text = " or ".join(f"{name.replace('_', ' ')} {p[name]:.0%}" for name in stated)
+    if len(stated) > 1:
+        return text
+    return f"{text}: {'right' if stated == (fault,) else 'wrong'}"
 
 
 def _wrong_models(model: Model) -> dict[str, Model]:
@@ -101,26 +107,28 @@ def _wrong_models(model: Model) -> dict[str, Model]:
     }  # fmt: skip
 
 
-def models(data: Path) -> str:
+def models(data: Path) -> Table:
     """Return what is said of wrong models beside healthy logs of three packs."""
-    lines = []
+    table = Table("pack", "model", "error [V]", "among themselves [V]", "corrected [V]", "missed")
     recorded = {x.name: x for part in packs.PARTS for x in packs.recorded(data, part)}
     for name in ("i3", "car1", "lg_cold"):
         pack = recorded[name]
         logs, references = pack.logs[:1], pack.logs[1:9]
         model = fit(references, capacity_ah=pack.capacity_ah).model
         for label, wrong in _wrong_models(model).items():
-            found = diagnose(logs, wrong, references)
-            check = found.model_check
+            check = diagnose(logs, wrong, references).model_check
             missed = "; ".join(
                 f"{each.effect} "
                 + ", ".join(f"{v.value:.3g} {v.unit}" for v in each.parameters.values() if v.ci)
                 for each in check.missed
             )
             after = check.missed[-1].rmse_v if check.missed else check.references_rmse_v
-            lines.append(
-                f"{name:8s} {label:16s} {check.references_rmse_v:6.2f} → {after:5.2f} V"
-                f" (among themselves {check.among_themselves_rmse_v:.2f}):"
-                f" {missed or 'describes the healthy logs'}"
+            table.add_row(
+                name,
+                label,
+                f"{check.references_rmse_v:.2f}",
+                f"{check.among_themselves_rmse_v:.2f}",
+                f"{after:.2f}",
+                missed or "nothing",
             )
-    return "\n".join(lines)
+    return table
