@@ -71,7 +71,7 @@ MISMATCH_S: Final = 2.0 * SLOW_S
 estimate invalid [s]: twice the memory of the voltage's slow error."""
 
 ALARM: Final = 1e-6
-"""Probability of a failed test on a pack that agrees with its model."""
+"""Probability that the innovations of a pack that agrees with its model fail the test."""
 
 STEP_C_RATE: Final = 0.05
 """Least change of the current between rows that shows its sign [1/h]: 3 A at 60 Ah."""
@@ -144,7 +144,8 @@ class Estimator:
         self._memory = EstimatorMemory()
         self._power = PowerModel(self.online, self.settings.limits)
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
-        strain_at_most = float(chdtri(self.online.functions.number + 4, ALARM))
+        # Its mean under the model: real packs stay far below, as priors are wider than packs are.
+        strain_at_most = self.online.functions.number + 4.0
         self.tests = tested, float(chdtri(tested, ALARM)), strain_at_most
         of_model, of_input = self.model.temperature_source, self.settings.temperature_source
         is_same = "unknown" in {of_model, of_input} or of_model == of_input
@@ -376,7 +377,7 @@ class Estimator:
         """Test the innovations of the last ten minutes, and what the filter has learned.
 
         Under the model the normalised innovations are independent standard normal, and what is
-        learned of a constant is at most as far from its prior mean as the prior allows.
+        learned of the constants lies together within their priors.
         """
         memory, likelier = self._memory, self.hypotheses.likelier
         blocks, innovations_at_most, strain_at_most = self.tests
