@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import sys
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -456,3 +457,26 @@ def test_a_current_that_wraps_is_refused(pack: Pack) -> None:
     wrapped = np.where(logs[0].current_a > 0.0, 655.36 - logs[0].current_a, -logs[0].current_a)
     with pytest.raises(cangauge.InputError, match="charge and SoC contradict each other"):
         cangauge.judge([replace(logs[0], current_a=wrapped)], model)
+
+
+def unbroken(days: int) -> cangauge.Log:
+    """Return one log of days of a home storage, every 4 minutes."""
+    hours = np.arange(0.0, 24.0 * days, 1.0 / 15.0)
+    amps = 14.0 * np.sin(2.0 * np.pi * hours / 24.0)
+    log = cangauge.Log(3600.0 * hours, amps, np.full(hours.size, 53.0), np.full(hours.size, 20.0))
+    volts = cangauge.Model.prior("lfp", 16, 100.0).predict(log, initial_soc_pct=96.0).voltage_v
+    return replace(log, voltage_v=volts, soc_pct=97.0 - drawn_ah(log))
+
+
+def peak_bytes(log: cangauge.Log) -> int:
+    tracemalloc.start()
+    try:
+        cangauge.judge([log], chemistry="lfp", cells=16, capacity_ah=100.0)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_grows_with_the_rows() -> None:
+    peak_bytes(unbroken(days=2))  # what is loaded once
+    assert peak_bytes(unbroken(days=40)) < 5.0 * peak_bytes(unbroken(days=10))

@@ -13,9 +13,10 @@ from operator import attrgetter
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.sparse import csc_array, csr_array
 from scipy.special import logsumexp
 
-from cangauge._typing import FloatArray, IntArray
+from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.extras.judge.chain import Chain
 from cangauge.extras.judge.faults import Column, Priors, faults, healthy
 from cangauge.model.gaussian import Rows
@@ -119,7 +120,7 @@ class Linearised:
         self.faults = every if only is None else [every[k] for k in only]
         columns = [*self.healthy, *self.faults]
         self._S, self._Y, self._V = (
-            np.array([np.broadcast_to(getattr(each, of), soc_pct.size) for each in columns]).T
+            _sparse([getattr(each, of) for each in columns], soc_pct.size)
             for of in ("soc", "shown", "volts")
         )
         self._std = np.array([each.std for each in columns])
@@ -147,26 +148,27 @@ class Linearised:
         slope = chain.slope(self.soc_pct)
         error_v = chain.blocks.voltage_v - chain.voltage_v(self.soc_pct)
         error_v += slope * (self.soc_pct - counted_pct)
-        X = slope[:, None] * self._S + self._V
-        found = [Rows.prior(self._std[: len(self.healthy)], others=len(self.faults))]
+        total = Rows.prior(self._std[: len(self.healthy)], others=len(self.faults))
         for at, root in chain.voltage_noise(self._varies):
-            with_level = np.column_stack([chain.level_v[at], X[at]])
+            X = slope[at, None] * self._S[at].toarray() + self._V[at].toarray()
+            with_level = np.column_stack([chain.level_v[at], X])
             rows = Rows.correlated(with_level, error_v[at], root)
-            found.append((rows + Rows.prior(np.ones(1), others=self._std.size)).eliminated(1))
+            total += (rows + Rows.prior(np.ones(1), others=self._std.size)).eliminated(1)
         full = np.flatnonzero(chain.is_full)
-        found.append(Rows.of(self._S[full], 100.0 - counted_pct[full], FULL_STD_PCT))
+        total += Rows.of(self._S[full].toarray(), 100.0 - counted_pct[full], FULL_STD_PCT)
         later = [k for k, each in enumerate(chain.stretches) if each.continues]
         first = np.array([chain.stretches[k].blocks.start for k in later], dtype=np.intp)
         ends = np.array([chain.stretches[k].samples.start - 1 for k in later], dtype=np.intp)
         drawn_pct = chain.blocks.drawn_pct
         between_pct = drawn_pct[first] + chain.samples.drawn_pct[ends] - drawn_pct[first - 1]
         apart_pct = counted_pct[first - 1] - counted_pct[first] - between_pct
-        found.append(Rows.of(self._S[first] - self._S[first - 1], apart_pct, JOINT_PCT))
-        return _sum(found)
+        joints = (self._S[first] - self._S[first - 1]).toarray()
+        return total + Rows.of(joints, apart_pct, JOINT_PCT)
 
     def _gauge_rows(self, noise: GaugeNoise) -> Rows:
         """Return the rows of all counts, what is of each stretch alone integrated out."""
-        found, chain = [], self.chain
+        chain = self.chain
+        total = Rows(np.zeros((0, self._std.size + 1)), 0.0)
         for stretch in chain.stretches:
             at = np.flatnonzero(np.isfinite(chain.count_pct[stretch.blocks]))
             at += stretch.blocks.start
@@ -175,14 +177,14 @@ class Linearised:
             step_pct = float(chain.published.step_pct[last])
             white = noise.white_pct**2 + step_pct**2 / 12.0
             walk = noise.walk_pct**2 * np.minimum(hours[:, None], hours) + np.eye(at.size) * white
-            X = np.column_stack([np.ones(at.size), hours, drawn, self._Y[at]])
+            X = np.column_stack([np.ones(at.size), hours, drawn, self._Y[at].toarray()])
             y = chain.count_pct[at] - self._start_pct[at]
             root = np.asarray(np.linalg.cholesky(walk), dtype=np.float64)
             rows = Rows.correlated(X, y, root)
             drift = noise.drift_pct / np.sqrt(max(float(chain.samples.hours[last]), 1.0))
             own = np.array([noise.error_pct, drift, noise.scale_pct])
-            found.append((rows + Rows.prior(own, others=self._std.size)).eliminated(own.size))
-        return _sum(found)
+            total += (rows + Rows.prior(own, others=self._std.size)).eliminated(own.size)
+        return total
 
     def log_weights(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Return ln of the weight of a set of faults, and with each other fault added to it.
@@ -224,13 +226,16 @@ class Linearised:
         self, chosen: Sequence[int], rows: Rows, share: float = 1.0, *, is_counter: bool = True
     ) -> Fitted:
         """Return the posterior of a set of faults of a probability."""
-        n, zero = len(self.healthy), len(self.chain.stretches)
+        chain, n, zero = self.chain, len(self.healthy), len(self.chain.stretches)
         posterior = self._chosen(rows, chosen, np.zeros(0, dtype=np.intp)).posterior()
         X = self._S[:, [*range(n), *(n + k for k in chosen)]]
         pack_pct = self._counted_pct + X @ posterior.mean
-        X[:, zero] = 1.0
+        root = posterior.root
+        std_pct = np.concatenate(
+            [np.linalg.norm(X[each.blocks] @ root + root[zero], axis=1) for each in chain.stretches]
+        )
         units = np.array([self.faults[k].per_unit for k in chosen])
-        functions = slice(zero + 1, zero + 1 + self.chain.functions.number)
+        functions = slice(zero + 1, zero + 1 + chain.functions.number)
         return Fitted(
             share=share,
             is_counter=is_counter,
@@ -239,7 +244,7 @@ class Linearised:
             std=np.sqrt(np.diag(posterior.covariance)[n:]) * units,
             pack_pct=pack_pct,
             soc_pct=pack_pct + posterior.mean[zero],
-            std_pct=posterior.std_of(X),
+            std_pct=std_pct,
             functions=posterior.mean[functions],
             covariance=posterior.covariance[functions, functions],
             is_free=self.is_free(chosen),
@@ -252,9 +257,14 @@ class Linearised:
         return not counts.size or any(np.asarray(shown)[counts[-1]] for shown in levels)
 
 
-def _sum(rows: Sequence[Rows]) -> Rows:
-    table = np.concatenate([each.table for each in rows])
-    return Rows(table, sum(each.log_norm for each in rows)).reduced()
+def _sparse(columns: Sequence[FloatArray | BoolArray | float], size: int) -> csr_array:
+    """Return columns as a matrix: most are 0 but in a few stretches."""
+    every = [np.broadcast_to(each, size) for each in columns]
+    rows = [np.flatnonzero(each) for each in every]
+    values = np.concatenate([each[at] for each, at in zip(every, rows, strict=True)])
+    edges = np.cumsum([0, *(at.size for at in rows)])
+    shape = (size, len(columns))
+    return csc_array((values, np.concatenate(rows), edges), shape=shape, dtype=np.float64).tocsr()
 
 
 class _Weighed(NamedTuple):

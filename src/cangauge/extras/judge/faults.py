@@ -160,8 +160,8 @@ class Column:
 
     name: str
     std: float
-    soc: FloatArray | float = 0.0
-    shown: FloatArray | float = 0.0
+    soc: FloatArray | BoolArray | float = 0.0
+    shown: FloatArray | BoolArray | float = 0.0
     volts: FloatArray | float = 0.0
     place: tuple[str | int, ...] = ()
     since: int = 0
@@ -173,7 +173,7 @@ class Column:
 def healthy(chain: Chain, priors: Priors, soc_pct: FloatArray) -> list[Column]:
     """Return what a healthy pack and gauge show; first the start of each stretch, then the zero."""
     blocks = chain.blocks
-    starts = [_ones(blocks.stretch == k) for k in range(len(chain.stretches))]
+    starts = [blocks.stretch == k for k in range(len(chain.stretches))]
     offset_pct, offset_v = chain.sensor("current_offset")
     capacity_ah = chain.model.capacity_ah
     return [
@@ -185,7 +185,7 @@ def healthy(chain: Chain, priors: Priors, soc_pct: FloatArray) -> list[Column]:
         Column("voltage", priors.voltage_pct, volts=chain.sensor("voltage_gain")[1]),
         Column("offset", capacity_ah / 400.0, soc=offset_pct, volts=offset_v),
         Column("capacity", priors.capacity_pct, soc=chain.sensor("capacity")[0]),
-        *(Column("piece", PIECE_PCT, shown=_ones(chain.piece == n)) for n in _pieces(chain)),
+        *(Column("piece", PIECE_PCT, shown=chain.piece == n) for n in _pieces(chain)),
     ]
 
 
@@ -205,11 +205,11 @@ def faults(chain: Chain, soc_pct: FloatArray) -> list[Column]:
 
 def _families(chain: Chain, soc_pct: FloatArray) -> Iterator[tuple[list[Column], float]]:
     """Yield the shapes of each fault, and its prior probability."""
-    blocks, stretches = chain.blocks, range(len(chain.stretches))
+    blocks, onsets = chain.blocks, _onsets(chain)
     for piece in _pieces(chain):
         yield list(_levels(chain, piece)), P_LEVEL
     yield list(_levels_in_pauses(chain)), P_FAULT
-    yield [each for k in stretches for each in _offsets(chain, k)], P_FAULT
+    yield [each for k in onsets for each in _offsets(chain, k)], P_FAULT
     scales = list(_scales(chain, soc_pct))
     for name in ("count_scale", "pack_capacity"):
         yield [each for each in scales if each.name == name], P_FAULT
@@ -219,7 +219,7 @@ def _families(chain: Chain, soc_pct: FloatArray) -> Iterator[tuple[list[Column],
     volts = chain.sensor("voltage_gain")[1]
     sensor = Column("voltage_sensor", SENSOR_PCT, place=("voltage_sensor",))
     yield (
-        [replace(sensor, volts=volts * (blocks.stretch >= k), since=k) for k in stretches],
+        [replace(sensor, volts=volts * (blocks.stretch >= k), since=k) for k in onsets],
         P_SELDOM,
     )
     least = LEAST_SLOPE * float(np.ptp(chain.extended.model.pseudo_ocv([5.0, 95.0]))) / 90.0
@@ -239,8 +239,15 @@ def _families(chain: Chain, soc_pct: FloatArray) -> Iterator[tuple[list[Column],
     )
 
 
-def _ones(is_inside: BoolArray) -> FloatArray:
-    return is_inside.astype(np.float64)
+def _onsets(chain: Chain) -> list[int]:
+    """Return the stretches with which a fault of a sensor may begin.
+
+    It is each after a pause. Within an unbroken record nothing marks the moment, which is told to a
+    part of how long ago it is: counted from the end it is the 1st stretch, the 2nd, 4th, 8th, ….
+    """
+    number = len(chain.stretches)
+    back = {2**k for k in range(number.bit_length())}
+    return [k for k, each in enumerate(chain.stretches) if not each.continues or number - k in back]
 
 
 def _pieces(chain: Chain) -> list[int]:
@@ -259,7 +266,7 @@ def _levels(chain: Chain, piece: int) -> Iterator[Column]:
         yield Column(
             "start_or_reset",
             LEVEL_PCT,
-            shown=_ones((numbers >= low) & (numbers <= high)),
+            shown=(numbers >= low) & (numbers <= high),
             place=("level", piece, since),
             since=since,
         )
@@ -279,7 +286,7 @@ def _levels_in_pauses(chain: Chain) -> Iterator[Column]:
                 yield Column(
                     "start_or_reset",
                     LEVEL_PCT,
-                    shown=_ones(shown),
+                    shown=shown,
                     place=("level", piece, since),
                     since=since,
                 )
