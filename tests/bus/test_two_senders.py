@@ -12,7 +12,7 @@ import can
 import pytest
 
 from cangauge.bus.decoder import SUSPECTED_FOR_S, SampleDecoder
-from cangauge.bus.protection import Protection
+from cangauge.bus.protection import FrameChecker, Protection
 from cangauge.bus.recording import capture_samples, open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.replay.encoder import FrameEncoder
@@ -121,13 +121,13 @@ def test_a_flood_and_single_false_frames_are_reported(
     assert decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
 
 
-# Without a stated period, frames show it before the flood.
-@pytest.mark.parametrize(("vehicle", "begins"), [(LEAF, 0), (LEAF, FROM), (GENERIC, FROM)])
+@pytest.mark.parametrize("vehicle", [LEAF, GENERIC])
 @pytest.mark.parametrize("times", [2, 5, 10])
 @pytest.mark.parametrize("ahead", [1, 2, 3])
 def test_a_flood_that_begins_anew_at_each_true_frame_is_reported(
-    vehicle: Vehicle, times: int, ahead: int, begins: int
+    vehicle: Vehicle, times: int, ahead: int
 ) -> None:
+    begins = FROM  # the frames before it show the period
     period_s, rule, out, number = PERIODS_S[vehicle.name], rule_of(vehicle), [], 0
     for frame in true_frames(vehicle):
         out.append(frame)
@@ -254,6 +254,18 @@ def test_one_sender_is_never_taken_for_two(name: str) -> None:
         decoder, _ = decoded(LEAF, list(LAWFUL[name](true_frames(LEAF, 1500), rng)))
         assert decoder.statistics.two_senders == 0, f"seed {seed}"
         assert decoder.two_sender_messages == (), f"seed {seed}"
+
+
+@pytest.mark.parametrize("period_s", [0.002, 0.005, 0.02, 0.1, 2.0])
+@pytest.mark.parametrize("lost", [0.02, 0.05, 0.2])
+def test_a_wrong_stated_period_makes_no_second_sender(period_s: float, lost: float) -> None:
+    rng = Random(1)  # noqa: S311 - must be repeatable
+    checker = FrameChecker(rule_of(GENERIC), period_s)
+    for number in range(4000):
+        data = rule_of(GENERIC).protect(number.to_bytes(8, "big"), number)
+        if rng.random() > lost:
+            checker.check(data, BEGINS_S + 0.01 * number)
+            assert not checker.suspects_second_sender
 
 
 def test_remarks_of_a_capture_name_it(tmp_path: Path) -> None:

@@ -332,9 +332,8 @@ class FrameChecker:
         self._step_s = math.inf  # between the latest two frames in sequence
         self._content: bytes | bytearray = b""
         self._is_repeated = False
-        # A stated period beyond a silence is of another unit.
-        is_stated = period_s is not None and period_s <= SILENCE_S
-        self._sent_every_s = period_s if is_stated else 0.0
+        # As seen, 0 before: a stated period is wrong too often to accuse anybody by it.
+        self._sent_every_s = 0.0
         self._surplus = 0.0
         self._run, self._run_s = 0, 0.0
         self.lost = 0
