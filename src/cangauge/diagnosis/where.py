@@ -26,7 +26,7 @@ DRAWS: Final = 400
 LEAST_PIECES: Final = 3
 """Pieces with rows in an interval from which on its error is told apart: two always agree."""
 DIFFERENT: Final = 1.3
-"""Ratio of errors from which a place or a correction is told apart: a third is seen in a plot."""
+"""Smallest ratio of errors that counts as a difference: a third is visible in a plot."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,7 +80,7 @@ def make_estimator(model: Model, settings: EstimatorSettings | None = None) -> E
     if is_compiled():
         try:
             return CompiledEstimator(model, settings)
-        except ValueError as lacking:  # an effect, or a place for so many numbers
+        except ValueError as lacking:  # the core lacks an effect, or has too few places
             emit(_LOG, logging.INFO, "core.lacking", f"estimating in Python: {lacking}")
     return Estimator(model, settings)
 

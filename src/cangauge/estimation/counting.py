@@ -24,7 +24,7 @@ from cangauge.logs.gaps import BRIDGE_S
 
 USE_S: Final = 120.0
 """Time for which the current before an unobserved interval may have continued into it [s]: two
-minutes of driving that nobody saw."""
+minutes of unrecorded driving."""
 
 UNKNOWN_STD_PCT: Final = math.sqrt(2000.0)
 """Standard deviation of an unknown SoC [%]: wider than 0–100 % (uniform: 29 %), so that the voltage

@@ -272,7 +272,7 @@ class SocFilter:
         return x, np.block([[self.P + V @ Pb @ V.T, V @ Pb], [Pb @ V.T, Pb]])
 
     def copy(self) -> Self:
-        """Return a copy, which goes on by itself."""
+        """Return an independent copy."""
         other = copy(self)
         other.bias = copy(self.bias)
         return other

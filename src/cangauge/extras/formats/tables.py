@@ -202,8 +202,8 @@ def _by_name(
 class _Series(Channels):
     """Times [s] and values of each series of a long table, in the order of time.
 
-    `label` is the heading of the times, `how` tells how times are read, `names` is the heading of
-    the series' names.
+    `label` is the heading of the times, `how` their reading, `names` the heading of the series'
+    names.
     """
 
     time = "time"

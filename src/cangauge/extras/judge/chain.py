@@ -50,7 +50,7 @@ SECANT_PCT: Final = 1.0
 """Half width over which the curve's slope is taken [%]: about the σ of the SoC."""
 
 FULL_H: Final = 1.0 / 12.0
-"""A charge has ended full where the voltage was held so long [h], …"""
+"""Least time for which a full charge holds its voltage [h], …"""
 FULL_C_RATE: Final = 0.05
 """… with less current than this at its end [1/h], of either sign since the sensor may be off, …"""
 FULL_TAPER: Final = 0.5
@@ -257,7 +257,7 @@ class Chain:
         return np.clip(known, 0.0, 100.0)
 
     def at_blocks(self, values: FloatArray, before_s: float = 0.0) -> FloatArray:
-        """Return what is known at some of the samples at the blocks, or so long before them."""
+        """Return the latest known value at each block, or `before_s` earlier."""
         hours, found = self.blocks.hours - before_s / 3600.0, np.full(self.piece.size, np.nan)
         for each in self.stretches:
             known = np.flatnonzero(np.isfinite(values[each.samples])) + each.samples.start

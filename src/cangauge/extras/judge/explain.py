@@ -31,7 +31,7 @@ log to log too. Of 0.5, 1, 2 and 4 the evidence of every development chain chose
 MOST_MOVES: Final = 10
 """Sets of faults that are tried one after the other."""
 BEYOND: Final = 3.0
-"""A fault whose size is beyond so many of its prior standard deviations is no explanation."""
+"""Largest size of a fault that can explain an error [prior standard deviations]."""
 ITERATIONS: Final = 8
 """Linearisations at most, …"""
 DAMPING: Final = 0.6

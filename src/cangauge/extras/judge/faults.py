@@ -242,8 +242,8 @@ def _families(chain: Chain, soc_pct: FloatArray) -> Iterator[tuple[list[Column],
 def _onsets(chain: Chain) -> list[int]:
     """Return the stretches with which a fault of a sensor may begin.
 
-    It is each after a pause. Within an unbroken record nothing marks the moment, which is told to a
-    part of how long ago it is: counted from the end it is the 1st stretch, the 2nd, 4th, 8th, ….
+    After a pause it may be each. Within an unbroken record nothing marks the moment, so that it is
+    found to a factor of two: the last stretch, the last two, four, eight, ….
     """
     number = len(chain.stretches)
     back = {2**k for k in range(number.bit_length())}

@@ -20,11 +20,11 @@ EPOCH_S: Final = 1e8
 OFF_PCT: Final = 3.0
 """Error from which a gauge is off [% SoC]."""
 STOOD_PCT: Final = 5.0
-"""Charge from which it is told that a gauge stood still before [%]."""
+"""Least charge for which an earlier standstill is reported [%]."""
 SURE: Final = 1.96
 """Half width of an interval of 95 % in standard deviations."""
 DOUBT: Final = 0.1
-"""Probability from which a doubt is told."""
+"""Least probability of an alternative that is reported."""
 ABOVE_PCT: Final = 100.05
 """Published SoC beyond what rounds to 100 % [%]."""
 
