@@ -3,12 +3,15 @@
     python benchmarks/figures.py           # brings the tables of all pages up to date
 
 A command that measures calls `publish`; with `--keep` it writes `figures/NAME.json`: date, commit,
-command, tables, and a digest of the code that the figures describe. A page shows them between
-`<!-- figures NAME -->` and `<!-- end -->`. Figures whose code has changed since are marked.
+command, tables, and a digest of the code that the figures describe, without its comments. A page
+shows them between `<!-- figures NAME -->` and `<!-- end -->`. Figures whose code has changed since
+are marked.
 """
 
 from __future__ import annotations
 
+import ast
+import functools
 import hashlib
 import json
 import re
@@ -26,6 +29,7 @@ from rich.text import Text
 ROOT: Final = Path(__file__).resolve().parents[1]
 FOLDER: Final = Path(__file__).with_name("figures")
 SHOWN: Final = re.compile(r"(<!-- figures ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+C_COMMENT: Final = re.compile(r"/\*.*?\*/|//[^\n]*", re.DOTALL)
 OLDER: Final = "**Older than the code**"
 
 
@@ -90,15 +94,38 @@ def _command(given: Sequence[str]) -> str:
     return " ".join([script, *arguments])
 
 
+@functools.cache
 def digest(path: str) -> str:
-    """Return a digest of a file, or of the sources in a folder."""
+    """Return a digest of a file's code, or of the code in a folder, without comments."""
     place = ROOT / path
     files = [place] if place.is_file() else sorted(place.rglob("*.[pch]*"))
     found = hashlib.sha256()
     for file in files:
-        if file.suffix in {".py", ".c", ".h"}:
-            found.update(file.read_bytes())
+        if file.suffix in WITHOUT_COMMENTS:
+            code = WITHOUT_COMMENTS[file.suffix](file.read_text(encoding="utf-8"))
+            found.update(code.encode())
     return found.hexdigest()[:16]
+
+
+def _python_code(text: str) -> str:
+    """Return Python without comments, docstrings and layout."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [each for each in node.body if not _is_text(each)]
+    return ast.dump(tree)
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
+
+def _c_code(text: str) -> str:
+    """Return C without comments and layout."""
+    return " ".join(C_COMMENT.sub(" ", text).split())
+
+
+WITHOUT_COMMENTS: Final = {".py": _python_code, ".c": _c_code, ".h": _c_code}
 
 
 def shown(name: str, *, marks_older: bool = True) -> str:

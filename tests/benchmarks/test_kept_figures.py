@@ -41,3 +41,22 @@ def test_a_count_20_percent_above_the_kept_one_fails() -> None:
     assert counts.worse(found, {"frame": 100, "start": 100}) == [
         "frame: 121, more than 20 % above 100"
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "commented", "other"),
+    [
+        ("a.py", "x = 1\n", '"""A module."""\n\nx = 1  # metres\n"""Width [m]."""\n', "x = 2\n"),
+        ("a.c", "int x = 1;\n", "/* Width,\n in m. */\nint  x = 1; // m\n", "int x = 2;\n"),
+    ],
+)
+def test_a_comment_makes_no_figure_older(
+    tmp_path: Path, name: str, code: str, commented: str, other: str
+) -> None:
+    digests = []
+    for number, text in enumerate((code, commented, other)):
+        path = tmp_path / str(number) / name
+        path.parent.mkdir()
+        path.write_text(text, encoding="utf-8")
+        digests.append(figures.digest(str(path)))
+    assert digests[0] == digests[1] != digests[2]
