@@ -12,121 +12,223 @@ from typing import Any, ClassVar, Final
 
 import can
 
-from cangauge.bus.readers import LineReader, PatternReader, Stamps, candump_frame, frame
+from cangauge.bus.readers import LineReader, candump_frame, frame
+
+_X: Final = "[0-9A-Fa-f]"
+_AT_ZERO: Final = dict.fromkeys(("clock", "time", "decimals", "us", "ms", "hex_ms"), "0")
 
 
-class SpacedReader(PatternReader):
-    """Time, id, length, bytes: traces of older CAN Hackers, and of loggers on microcontrollers."""
+class LineFormat(LineReader):
+    """Text whose frames all match one pattern.
+
+    Attributes
+    ----------
+    pattern : str
+        Regular expression. Its groups: the parts of the time, which are added (`clock`, `h:m:s` or
+        seconds; `time`, decimal seconds; `decimals` of a second; `us`, `ms`, `hex_ms`); `id` [hex]
+        or `decimal`, and `long` or `short` where the line states its width; `data` [hex], `length`,
+        `remote`; `bus` (a number, by default 1) or `channel` (its name); `way`, where T or S begins
+        that of a sent frame.
+    begins, other : str
+        Regular expressions of the first line, and of lines that state no frame.
+    """
+
+    pattern: ClassVar[str]
+    begins: ClassVar[str] = ""
+    other: ClassVar[str] = "(?!)"
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Check the first line."""
+        return re.match(self.begins, head[0]) is not None
+
+    def parse(self, line: str) -> can.Message | None:
+        """Return the frame of a line."""
+        match = re.match(self.pattern, line)
+        if match is not None:
+            return self.frame_of(match.groupdict(""))
+        if re.match(self.other, line):
+            return None
+        raise ValueError("not a frame")
+
+    def frame_of(self, groups: dict[str, str]) -> can.Message:
+        """Return the frame of the groups of the pattern."""
+        of = _AT_ZERO | groups
+        time_s = float(of["time"]) + float(f"0.{of['decimals']}") + int(of["hex_ms"], 16) / 1e3
+        time_s += float(of["ms"]) / 1e3 + float(of["us"]) / 1e6
+        clock_s = 0
+        for part in of["clock"].split(":"):
+            clock_s = 60 * clock_s + int(part)
+        is_wide = bool(groups.get("long"))
+        return frame(
+            clock_s + time_s,
+            int(groups["decimal"]) if groups.get("decimal") else groups["id"],
+            None if groups.get("remote") else groups["data"],
+            groups.get("length"),
+            is_extended=is_wide if is_wide or groups.get("short") else None,
+            channel=int(groups["bus"] or 1) if "bus" in groups else groups.get("channel"),
+            is_rx=groups.get("way", "R")[0].upper() not in "TS",
+        )
+
+
+class SpacedReader(LineFormat):
+    """Traces of older CAN Hackers, and of loggers on microcontrollers; whole stamps are in ms."""
 
     name = "seconds, id, length, bytes"
     # 0000.004429 000001DB 8 FD A0 BA AA 00 00 01 A8
     # 1512293  5F1  8  A8 16 65 9 0 0 0 0
-    pattern = re.compile(
-        r"(\d++(?:\.\d++)?) ++([0-9A-Fa-f]{1,8}) ++(\d{1,2})"
-        r"((?: ++(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f](?=\s)))*+)\s*$"  # a cut byte is none of one digit
+    pattern = (
+        rf"(?P<time>\d++(?:\.\d++)?) ++(?P<id>{_X}{{1,8}}) ++(?P<length>\d{{1,2}})"
+        rf"(?P<data>(?: ++(?:{_X}{{2}}|{_X}(?=\s)))*+)\s*$"  # a cut byte is none of one digit
     )
-    other = re.compile(r"Time\s++ID\s++DLC\b")
+    other = r"Time\s++ID\s++DLC\b"
 
     def prepare(self, head: Sequence[str]) -> bool:
-        """Find the unit of the stamps: whole ones are milliseconds."""
-        first = next(filter(None, map(self.pattern.match, head)), None)
-        if first is not None and "." not in first[1]:
+        """Find the unit of the stamps by the first frame."""
+        found = (re.match(self.pattern, line) for line in head)
+        first = next(filter(None, found), None)
+        if first is not None and "." not in first["time"]:
             self.stamps = "ms"
         return first is not None
 
-    def _frame(self, *groups: Any) -> can.Message:
-        time, number, length, data = groups
-        time_s = float(time) / (1e3 if self.stamps == "ms" else 1.0)
-        return frame(time_s, number, "".join(f"{byte:0>2}" for byte in data.split()), length)
+    def frame_of(self, groups: dict[str, str]) -> can.Message:
+        """Return the frame of the groups of the pattern."""
+        groups["data"] = "".join(f"{byte:0>2}" for byte in groups["data"].split())
+        if self.stamps == "ms":
+            groups["ms"] = groups.pop("time")
+        return super().frame_of(groups)
 
 
-class TableReader(PatternReader):
-    """Tab-separated table, time in whole milliseconds."""
+class _CandumpFormat(LineFormat):
+    """Screen output of candump: ids of eight digits are extended, and have flags."""
 
-    name = "tab-separated table"
-    stamps: Stamps = "ms"
-    # ParserFlags <tab> Ch <tab> Counter <tab> T/R <tab> Time <tab> Flags <tab> CAN ID <tab> Len …
-    # 1 <tab> 0 <tab> 14767 <tab> RX <tab> 1052620673 <tab> <tab> 0x000001da <tab> 8 <tab> 0xc8 …
-    pattern = re.compile(
-        r"[^\t]*\t(\d+)\t[^\t]*\t(\w+)\t(\d+)\t[^\t]*\t(0x\w+)\t(\d+)\t(?:0x)?([0-9A-Fa-f ]*)\s"
-    )
-    other = re.compile("ParserFlags\t")
-
-    def _frame(self, *groups: Any) -> can.Message:
-        channel, way, time, number, length, data = groups
-        is_rx = way != "TX"
-        return frame(int(time) / 1e3, number, data, length, channel=int(channel), is_rx=is_rx)
-
-
-class CrtdReader(PatternReader):
-    """CRTD of OVMS, also as SavvyCAN writes it."""
-
-    name = "CRTD (OVMS)"
-    states_length = False
-    # 1632509059.541604 2R11 174 00 00 00 aa 0f 00 00 00
-    pattern = re.compile(
-        r"(\d+\.\d+) (\d*)([RT])(11|29) ([0-9A-Fa-f]{1,8})((?: [0-9A-Fa-f]{2})*)\s*$"
-    )
-    other = re.compile(r"\d+\.\d+ \d*C[A-Z]{2}\b")
-
-    def _frame(self, *groups: Any) -> can.Message:
-        time, channel, way, bits, number, data = groups
-        return frame(
-            time,
-            number,
-            data,
-            is_extended=bits == "29",
-            channel=int(channel or 1),
-            is_rx=way == "R",
-        )
-
-
-class BatteryEmulatorReader(PatternReader):
-    """Log of Battery-Emulator's web page: its ids are not padded, else it looks like candump's."""
-
-    name = "Battery-Emulator log"
-    # (216.112) RX0 7A [8] 00 00 D2 B6 BC 5E 00 00
-    pattern = re.compile(
-        r"\((\d++\.\d++)\) ([RTrt][Xx]\d++) ([0-9A-Fa-f]{1,8}) \[(\d++)\]((?: [0-9A-Fa-f]{2}\b)*)"
-    )
-
-    def _frame(self, *groups: Any) -> can.Message:
-        time, channel, number, length, data = groups
-        return frame(time, number, data, length, channel=channel, is_rx=channel[0] in "Rr")
-
-
-class CandumpReader(PatternReader):
-    """Screen output of candump with stamps: absolute, or dates, which are taken as UTC."""
-
-    name = "candump with stamps"
-    has_stamps: ClassVar[bool] = True
-    #  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
-    #  (2015-07-09 06:17:32.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
-    # Possessive (++): no backtracking over a line of 16,000 blanks.
-    pattern = re.compile(
-        r"\s*+(?:\(((\d{4}-\d\d-\d\d \d\d:\d\d:)?\d++\.\d++)\)\s*+)?"
-        r"(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
-        r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
-        r"\s++\[(\d++)\]\s++(remote request|(?:[0-9A-Fa-f]{2}\b ?)*)"
-    )
-
-    def _frame(self, *groups: Any) -> can.Message:
-        time, date, channel, number, length, data = groups
-        if (time is not None) is not self.has_stamps:
-            raise ValueError("only some lines have stamps")
+    def frame_of(self, groups: dict[str, str]) -> can.Message:
+        """Return the frame of the groups of the pattern; a date is taken as UTC."""
+        time, date = groups.get("time", "0"), groups.get("date")
         if date:
-            time = f"{datetime.fromisoformat(f'{time}+00:00').timestamp():.6f}"
-        content = None if data == "remote request" else data
-        return candump_frame(time or "0", channel, number, content, length)
+            time = f"{datetime.fromisoformat(f'{date}{time}+00:00').timestamp():.6f}"
+        content = None if groups["remote"] else groups["data"]
+        return candump_frame(time, groups["channel"], groups["id"], content, groups["length"])
 
 
-class UnstampedCandumpReader(CandumpReader):
-    """Screen output of candump without stamps."""
+def _format(
+    name: str, pattern: str, base: type[LineFormat] = LineFormat, **more: object
+) -> type[LineFormat]:
+    """Return the reader of a format by its attributes."""
+    reader: Any = type(name, (base,), {"name": name, "pattern": pattern, **more})
+    return reader  # type: ignore[no-any-return]
 
-    name = "candump without stamps"
-    stamps: Stamps = "none"
-    has_stamps = False
 
+# ParserFlags <tab> Ch <tab> Counter <tab> T/R <tab> Time <tab> Flags <tab> CAN ID <tab> Len …
+# 1 <tab> 0 <tab> 14767 <tab> RX <tab> 1052620673 <tab> <tab> 0x000001da <tab> 8 <tab> 0xc8 …
+TableReader = _format(
+    "tab-separated table",
+    r"[^\t]*\t(?P<bus>\d+)\t[^\t]*\t(?P<way>\w+)\t(?P<ms>\d+)\t[^\t]*\t(?P<id>0x\w+)"
+    rf"\t(?P<length>\d+)\t(?:0x)?(?P<data>(?:{_X}| )*)\s",
+    stamps="ms",
+    other="ParserFlags\t",
+)
+# Also as SavvyCAN writes it.
+# 1632509059.541604 2R11 174 00 00 00 aa 0f 00 00 00
+CrtdReader = _format(
+    "CRTD (OVMS)",
+    r"(?P<time>\d+\.\d+) (?P<bus>\d*)(?P<way>[RT])(?:(?P<short>11)|(?P<long>29))"
+    rf" (?P<id>{_X}{{1,8}})(?P<data>(?: {_X}{{2}})*)\s*$",
+    states_length=False,
+    other=r"\d+\.\d+ \d*C[A-Z]{2}\b",
+)
+# Of its web page; its ids are not padded, else it looks like candump's.
+# (216.112) RX0 7A [8] 00 00 D2 B6 BC 5E 00 00
+BatteryEmulatorReader = _format(
+    "Battery-Emulator log",
+    r"\((?P<time>\d++\.\d++)\) (?P<channel>(?P<way>[RTrt])[Xx]\d++)"
+    rf" (?P<id>{_X}{{1,8}}) \[(?P<length>\d++)\](?P<data>(?: {_X}{{2}}\b)*)",
+)
+# SavvyCAN's generic CSV.
+# 4F5,FF 34 23 45 24 E4
+IdDataReader = _format(
+    "SavvyCAN id and data CSV",
+    rf"(?P<id>{_X}{{3,8}}),(?P<data>(?:{_X}{{2}} ?){{0,64}})\s*$",
+    stamps="none",
+    states_length=False,
+    begins=r"\s*ID,Data",
+    other="ID,Data",
+)
+# Of openpilot.
+# 15.460,0x440,1,0x4000800000000000
+CabanaReader = _format(
+    "cabana CSV",
+    r"(?P<time>\d+(?:\.\d+)?),(?:(?P<id>0x[0-9A-Fa-f]{1,8})|(?P<decimal>0|[1-9]\d{0,8}))"
+    r",(?P<bus>\d{1,9}),(?:0x)?(?P<data>(?:[0-9A-Fa-f]{2}){0,64})\s*$",
+    states_length=False,
+    begins="time,addr,bus,data",
+    other="time,addr,bus,data",
+)
+# CARBUS Analyzer (canhacker.ru): seconds, and their microseconds, before version 3 milliseconds.
+# @ TEXT @ 3 @ 64 @ 0 @ 1149 @ 7459 @ 00:00:07.459 @
+# 26,641405 <tab> 1 <tab> 00000004 <tab> 112 <tab> 8 <tab> 00 20 C1 0E 01 72 89 00 <tab> …
+_CARBUS: Final = r"\t(?P<bus>\d+)\t[^\t]*\t(?P<id>\w+)\t(?P<length>\d+)\t(?P<data>[^\t]*)"
+CarbusReader = _format(
+    "CARBUS Analyzer trace",
+    rf"(?P<clock>\d+),(?P<us>\d+){_CARBUS}",
+    begins="@ TEXT @ [3-9] @",
+    other="[@#]",
+)
+CarbusMsReader = _format(
+    "CARBUS Analyzer trace",
+    rf"(?P<clock>\d+),(?P<ms>\d+){_CARBUS}",
+    stamps="ms",
+    begins="@ TEXT @ [0-2] @",
+    other="[@#]",
+)
+# Time of day in milliseconds.
+# > <tab> 2 <tab>  17:18:39.355:2240.00 <tab> St <tab> 0x112 <tab> 0 <tab> 8 <tab> … <tab> p:2
+# Minutes, seconds and milliseconds are not padded (17:19:9.69 is 9.069 s); after them stand
+# the microseconds since the frame before. Bytes that a frame lacks are blank.
+CanHackerReader = _format(
+    "CAN Hacker log",
+    r">\t[^\t]*\t\s*(?P<clock>\d{1,2}:\d{1,2}:\d{1,2})\.(?P<ms>\d{1,3})(?::\d+(?:\.\d+)?)?"
+    r"\t(?:St|(?P<long>Ext))\t(?P<id>\w+)\t[^\t]*\t(?P<length>\d+)"
+    rf"(?P<data>(?:\t{_X}{{2}})*)(?:\t *)*?\tp:(?P<bus>\d+)\s*$",
+    stamps="ms",
+    other="CAN speed",
+)
+# Of the tool of CANalyst-II and its kin: time of day in milliseconds.
+# NO    Direction  Time Scale        Frame Type      Frame Format     Frame ID  Length  Data
+# 0     Receive    18:00:00:125      Data frame      Standard frame   00000356  8       f2 0e …
+UsbCanReader = _format(
+    "USB-CAN tool text",
+    r"(?i)\s*+\d+[\s,]++(?P<way>Receive|Send|Transmit)[\s,]++(?P<clock>\d{1,2}:\d\d:\d\d)[:.]"
+    r"(?P<decimals>\d{1,6})[\s,]++(?:Data|(?P<remote>Remote)) frame[\s,]++"
+    r"(?:(?P<short>Standard)|(?P<long>Extended)) frame[\s,]++(?:0x)?(?P<id>[0-9A-F]{1,8})"
+    r"[\s,]++(?:0x)?(?P<length>\d{1,2})[\s,]*+(?P<data>(?:[0-9A-F]{2} ?)*+)\s*$",
+    stamps="ms",
+    other=r"(?i)\s*(?:NO\b|Index\b)",
+)
+# Of slcan (Lawicel) adapters: milliseconds of a minute, in four digits.
+# t35680EFA003EA000009AB0
+SlcanReader = _format(
+    "slcan text with stamps",
+    rf"(?:(?P<short>t)|(?P<long>T))(?P<id>(?<=t){_X}{{3}}|(?<=T){_X}{{8}})(?P<length>[0-8])"
+    rf"(?P<data>(?:{_X}{{2}})*)(?P<hex_ms>{_X}{{4}})\s*$",
+    stamps="ms",
+    other=r"(?i)[rRzZFVNCOSMm][0-9A-F]*\s*$",
+)
+# Possessive (++): no backtracking over a line of 16,000 blanks.
+_CANDUMP: Final = (
+    r"(?P<channel>[^\s(]\S*+)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
+    rf"(?P<id>{_X}{{3}}|{_X}{{8}})\s++\[(?P<length>\d++)\]\s++"
+    rf"(?:(?P<remote>remote request)|(?P<data>(?:{_X}{{2}}\b ?)*))"
+)
+#  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
+#  (2015-07-09 06:17:32.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
+CandumpReader = _format(
+    "candump with stamps",
+    rf"\s*+\((?P<date>\d{{4}}-\d\d-\d\d \d\d:\d\d:)?(?P<time>\d++\.\d++)\)\s*+{_CANDUMP}",
+    _CandumpFormat,
+)
+UnstampedCandumpReader = _format(
+    "candump without stamps", rf"\s*+{_CANDUMP}", _CandumpFormat, stamps="none"
+)
 
 _FRAMES_FOR_UNIT: Final = 100
 """Frames of one bus from which stamps in milliseconds are distinguished from bursts."""
@@ -228,132 +330,6 @@ def _is_too_fast(frames: Sequence[can.Message]) -> bool:
 def _duration_s(frames: Sequence[can.Message]) -> float:
     times_s = [frame.timestamp for frame in frames]
     return max(times_s) - min(times_s)
-
-
-class IdDataReader(PatternReader):
-    """SavvyCAN's generic CSV of id and bytes, which has no time."""
-
-    name = "SavvyCAN id and data CSV"
-    stamps: Stamps = "none"
-    states_length = False
-    # 4F5,FF 34 23 45 24 E4
-    pattern = re.compile(r"([0-9A-Fa-f]{3,8}),((?:[0-9A-Fa-f]{2} ?){0,64})\s*$")
-    other = re.compile("ID,Data")
-
-    def prepare(self, head: Sequence[str]) -> bool:
-        """Check the headings."""
-        return head[0].strip().startswith("ID,Data")
-
-    def _frame(self, *groups: Any) -> can.Message:
-        return frame(0.0, *groups)
-
-
-class CabanaReader(PatternReader):
-    """CSV of openpilot's cabana: seconds, id (decimal without 0x), bus, bytes."""
-
-    name = "cabana CSV"
-    states_length = False
-    # 15.460,0x440,1,0x4000800000000000
-    pattern = re.compile(
-        r"(\d+(?:\.\d+)?),(0x[0-9A-Fa-f]{1,8}|\d{1,9}),(\d{1,9}),(?:0x)?((?:[0-9A-Fa-f]{2}){0,64})\s*$"
-    )
-    other = re.compile("time,addr,bus,data")
-
-    def prepare(self, head: Sequence[str]) -> bool:
-        """Check the headings."""
-        return self.other.match(head[0]) is not None
-
-    def _frame(self, *groups: Any) -> can.Message:
-        time, number, bus, data = groups
-        return frame(time, int(number, 0), data, channel=int(bus))
-
-
-class CarbusReader(PatternReader):
-    """CARBUS Analyzer (canhacker.ru): seconds and microseconds; before version 3 milliseconds."""
-
-    name = "CARBUS Analyzer trace"
-    # @ TEXT @ 3 @ 64 @ 0 @ 1149 @ 7459 @ 00:00:07.459 @
-    # 26,641405 <tab> 1 <tab> 00000004 <tab> 112 <tab> 8 <tab> 00 20 C1 0E 01 72 89 00 <tab> …
-    pattern = re.compile(r"(\d+),(\d+)\t(\d+)\t[^\t]*\t(\w+)\t(\d+)\t([^\t]*)")
-    other = re.compile("[@#]")
-    _HEADER: Final = re.compile(r"@ TEXT @ (\d) @")
-
-    def prepare(self, head: Sequence[str]) -> bool:
-        """Find the version."""
-        match = self._HEADER.match(head[0])
-        if match is not None and int(match[1]) < 3:
-            self.stamps = "ms"
-        return match is not None
-
-    def _frame(self, *groups: Any) -> can.Message:
-        seconds, fraction, channel, number, length, data = groups
-        time_s = int(seconds) + int(fraction) / (1e6 if self.stamps == "us" else 1e3)
-        return frame(time_s, number, data, length, channel=int(channel))
-
-
-class CanHackerReader(PatternReader):
-    """CAN Hacker log: time of day in milliseconds."""
-
-    name = "CAN Hacker log"
-    stamps: Stamps = "ms"
-    # > <tab> 2 <tab>  17:18:39.355:2240.00 <tab> St <tab> 0x112 <tab> 0 <tab> 8 <tab> … <tab> p:2
-    # Minutes, seconds and milliseconds are not padded (17:19:9.69 is 9.069 s); after them stand
-    # the microseconds since the frame before. Bytes that a frame lacks are blank.
-    pattern = re.compile(
-        r">\t[^\t]*\t\s*(\d{1,2}):(\d{1,2}):(\d{1,2})\.(\d{1,3})(?::\d+(?:\.\d+)?)?\t(St|Ext)"
-        r"\t(\w+)\t[^\t]*\t(\d+)((?:\t[0-9A-Fa-f]{2})*)(?:\t *)*?\tp:(\d+)\s*$"
-    )
-    other = re.compile("CAN speed")
-
-    def _frame(self, *groups: Any) -> can.Message:
-        hours, minutes, seconds, milliseconds, kind, number, length, data, channel = groups
-        time_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + int(milliseconds) / 1e3
-        is_extended = kind == "Ext" or None
-        return frame(time_s, number, data, length, is_extended=is_extended, channel=int(channel))
-
-
-class UsbCanReader(PatternReader):
-    """Text of the tool of CANalyst-II and its kin: time of day in milliseconds."""
-
-    name = "USB-CAN tool text"
-    stamps: Stamps = "ms"
-    # NO    Direction  Time Scale        Frame Type      Frame Format     Frame ID  Length  Data
-    # 0     Receive    18:00:00:125      Data frame      Standard frame   00000356  8       f2 0e …
-    pattern = re.compile(
-        r"\s*+\d+[\s,]++(Receive|Send|Transmit)[\s,]++(\d{1,2}):(\d\d):(\d\d)[:.](\d{1,6})[\s,]++"
-        r"(Data|Remote) frame[\s,]++(Standard|Extended) frame[\s,]++(?:0x)?([0-9A-Fa-f]{1,8})"
-        r"[\s,]++(?:0x)?(\d{1,2})[\s,]*+((?:[0-9A-Fa-f]{2} ?)*+)\s*$",
-        re.IGNORECASE,
-    )
-    other = re.compile(r"\s*(?:NO\b|Index\b)", re.IGNORECASE)
-
-    def _frame(self, *groups: Any) -> can.Message:
-        way, hours, minutes, seconds, fraction, kind, form, number, length, data = groups
-        time_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
-        content = data if kind.lower() == "data" else None
-        is_extended = form.lower() == "extended"
-        is_rx = way.lower() == "receive"
-        return frame(time_s, number, content, length, is_extended=is_extended, is_rx=is_rx)
-
-
-class SlcanReader(PatternReader):
-    """Text of slcan (Lawicel) adapters with stamps: milliseconds of a minute, in four digits."""
-
-    name = "slcan text with stamps"
-    stamps: Stamps = "ms"
-    # t35680EFA003EA000009AB0
-    pattern = re.compile(
-        r"(?:t([0-9A-F]{3})|T([0-9A-F]{8}))([0-8])((?:[0-9A-F]{2})*)([0-9A-F]{4})\s*$",
-        re.IGNORECASE,
-    )
-    other = re.compile(r"[rRzZFVNCOSMm][0-9A-F]*\s*$")
-
-    def _frame(self, *groups: Any) -> can.Message:
-        standard, extended, length, data, stamp = groups
-        is_extended = standard is None
-        return frame(
-            int(stamp, 16) / 1e3, extended or standard, data, length, is_extended=is_extended
-        )
 
 
 class AscReader(LineReader):
