@@ -202,7 +202,7 @@ def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
         stamps = np.sort(rng.uniform(0.0, seconds, int(200 * seconds) - 2))
         with Recorder(path) as recorder:
             for stamp in [0.0, *stamps.tolist(), seconds]:
-                recorder.write(
+                recorder.on_frame(
                     can.Message(timestamp=1.7e9 + stamp, arbitration_id=0x1F2, is_extended_id=False)
                 )
         done = subprocess.run(

@@ -39,6 +39,7 @@ from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantization_bound
+from cangauge.service.config import RunConfig
 from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
 from cangauge.service.output import Output
@@ -105,7 +106,7 @@ def over_bus(
         Recorder(record) as recorder,
     ):
         outputs = [_Rows(rows), recorder]
-        loop = Loop(receiver, pipeline, outputs=outputs, record=recorder)
+        loop = Loop(receiver, pipeline, RunConfig(model="-"), outputs=outputs)
         service = threading.Thread(target=loop.run, args=(done.is_set,))
         service.start()
         began = time.monotonic()

@@ -43,14 +43,15 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
+from cangauge.service.config import RunConfig
+from cangauge.service.loop import FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper
 from cangauge.settings import FrameIds
 from cangauge.types import Estimate, Reason, Sample
 from live_service import ENTRY
 
-EVERY_S = CHECKPOINT_EVERY_S
+EVERY_S = RunConfig.model_fields["state_every_s"].default
 RATE_HZ = 10
 BEGIN_PCT = 75.0
 MEAN_BETWEEN_KILLS_S = 60.0

@@ -10,11 +10,10 @@ import pytest
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.vehicle import Vehicle
-from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder
-from live import Service, leaf_model, waits
+from live import Service, leaf_model, loop_config, waits
 
 DBC = """VERSION "1"
 NS_ :
@@ -49,7 +48,7 @@ def estimates_from_64_bytes(address: BusAddress, folder: Path) -> None:
     with (
         Recorder(path) as recorder,
         BusConnection(open_bus(address, pipeline.filters), str(address)) as port,
-        Service(port, pipeline, LoopSettings(), recorder) as live,
+        Service(port, pipeline, loop_config(), recorder) as live,
         open_bus(address, []) as sender,
     ):
         for step in range(100):

@@ -32,8 +32,9 @@ from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.config import RunConfig
 from cangauge.service.events import RateLimitedHandler
-from cangauge.service.loop import Loop, LoopSettings
+from cangauge.service.loop import Loop
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.status import Monitor
@@ -122,7 +123,7 @@ class Service:
 
     port: BusConnection
     pipeline: Pipeline
-    settings: LoopSettings = field(default_factory=LoopSettings)
+    config: RunConfig
     record: Any = None
     checkpoint: Callable[[], None] = lambda: None
     rows: list[tuple[float, Estimate]] = field(default_factory=list)
@@ -161,15 +162,19 @@ class Service:
             loop = Loop(
                 self.port,
                 self.pipeline,
-                self.settings,
+                self.config,
                 outputs=[Rows(self.rows), *([self.record] if self.record else [])],
-                record=self.record,
                 monitor=self.monitor,
                 checkpoint=self.checkpoint,
             )
             loop.run(self._stop.is_set)
         except Exception as error:  # noqa: BLE001 - for the test to look at
             self.error = error
+
+
+def loop_config(**keys: Any) -> RunConfig:
+    """Return a configuration for a loop, whose pipeline has the model already."""
+    return RunConfig(model="-", **keys)
 
 
 def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConnection:
@@ -179,13 +184,13 @@ def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConne
 def virtual_service(
     channel: str,
     settings: PipelineSettings | None = None,
-    loop: LoopSettings | None = None,
     vehicle: Vehicle | None = None,
     record: Any = None,
+    **config: Any,
 ) -> Service:
     pipeline = Pipeline(vehicle or Vehicle.load("generic"), leaf_model(), settings)
     port = virtual_port(channel, pipeline.filters)
-    return Service(port, pipeline, loop or LoopSettings(), record)
+    return Service(port, pipeline, loop_config(**config), record)
 
 
 class BrokenBus:

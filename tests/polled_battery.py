@@ -11,9 +11,9 @@ import can
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, backend_capabilities, open_bus
 from cangauge.bus.vehicle import Vehicle
-from cangauge.service.loop import LoopSettings
+from cangauge.service.config import PollConfig
 from cangauge.service.pipeline import Pipeline
-from live import Service, leaf_model, waits
+from live import Service, leaf_model, loop_config, waits
 
 PROBES = bytes.fromhex("610402011401ff14020c13020e1313")
 """20 °C at the first probe."""
@@ -90,7 +90,7 @@ def polling_service(address: BusAddress, every_s: float = 1.0) -> Service:
     port = BusConnection(
         open_bus(address, pipeline.filters), str(address), backend_capabilities(address)
     )
-    return Service(port, pipeline, LoopSettings(poll_every_s=every_s))
+    return Service(port, pipeline, loop_config(poll=PollConfig(every_s=every_s)))
 
 
 def temperature_and_cells_come(address: BusAddress) -> None:
@@ -99,11 +99,11 @@ def temperature_and_cells_come(address: BusAddress) -> None:
         assert waits(lambda: service.monitor.polls is not None)  # the loop begins in its thread
         polls = service.monitor.polls
         assert polls is not None
-        assert waits(lambda: polls.answers >= 4)
+        assert waits(lambda: polls["answers"] >= 4)
         decoder = service.pipeline.decoder
         assert decoder.health["temperature"].value_at(time.time()) == 20.0
         assert decoder.cells is not None
         assert sorted({group for _, group in battery.requests}) == [2, 4]
         assert battery.early == 0
-    assert polls.unanswered == polls.negative == polls.other_tester == 0
+    assert polls["unanswered"] == polls["negative"] == polls["other_tester"] == 0
     assert service.monitor.foreign == 0

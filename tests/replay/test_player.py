@@ -291,7 +291,7 @@ def test_a_loop_runs_until_stopped() -> None:
 def test_full_speed_needs_the_vehicle_of_a_capture(tmp_path: Path) -> None:
     path = tmp_path / "a.log"
     with Recorder(path) as recorder:
-        recorder.write(can.Message(timestamp=1.0, arbitration_id=1, data=b"1"))
+        recorder.on_frame(can.Message(timestamp=1.0, arbitration_id=1, data=b"1"))
     with virtual_port("blind") as port, pytest.raises(InputError, match="--vehicle"):
         play(port, CaptureSource(path), MAX, stop=never)
 

@@ -27,7 +27,7 @@ def frame(time_s: float, frame_id: int = 0x123, data: bytes = b"\x01") -> can.Me
 def write(path: Path, frames: list[can.Message]) -> Path:
     with Recorder(path) as recorder:
         for each in frames:
-            recorder.write(each)
+            recorder.on_frame(each)
     return path
 
 

@@ -16,10 +16,11 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import loop
-from cangauge.service.loop import Loop, LoopSettings
+from cangauge.service.config import RunConfig
+from cangauge.service.loop import Loop
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Sample
-from live import leaf_model, never
+from live import leaf_model, loop_config, never
 
 BEGAN_S = 5000.0
 EPOCH_S = 1.7e9
@@ -98,21 +99,21 @@ def frames_every(
 
 def simulate(
     port: SimulatedPort,
-    settings: LoopSettings | float,
+    config: RunConfig | float,
     pipeline: Pipeline | None = None,
     **more: Any,
 ) -> SimulatedPort:
-    """Run the loop on a simulated port, by settings or for a duration [s]; return the port."""
+    """Run the loop on a simulated port, as configured or for a duration [s]; return the port."""
     clock = SimpleNamespace(
         monotonic=lambda: port.now_s,
         time=lambda: EPOCH_S + port.since_s,
         process_time=time.process_time,
     )
-    if isinstance(settings, float):
-        settings = LoopSettings(duration_s=settings)
+    if isinstance(config, float):
+        config = loop_config(duration_s=config)
     pipeline = pipeline or Pipeline(Vehicle.load("generic"), leaf_model(), GIVEN)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "time", clock)
         patch.setattr(loop, "steady_s", lambda: port.now_s)
-        Loop(port, pipeline, settings, **more).run(never)  # type: ignore[arg-type] # has what is used
+        Loop(port, pipeline, config, **more).run(never)  # type: ignore[arg-type] # has what is used
     return port

@@ -18,8 +18,9 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.loop import Loop, LoopSettings, OwnFrames
+from cangauge.service.loop import Loop
 from cangauge.service.output import Output
+from cangauge.service.own_frames import OwnFrames
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import (
@@ -27,6 +28,7 @@ from live import (
     Rows,
     frames_of,
     leaf_model,
+    loop_config,
     network_down,
     never,
     short_log,
@@ -93,7 +95,7 @@ def test_missed_heartbeats_are_skipped_on_the_grid() -> None:
 
 def test_soc_is_unknown_then_old_then_fresh_again() -> None:
     port = SimulatedPort([*frames_every(0.1, 4.0, 1.0), *frames_every(0.1, 40.0, 38.0)])
-    simulate(port, LoopSettings(timeout_s=0.3, duration_s=40.0))
+    simulate(port, loop_config(timeout_s=0.3, duration_s=40.0))
     unknown = [content for at_s, content in port.published if at_s < 0.9]
     assert {each.status for each in unknown} == {Status.INITIALISING}
     assert all(np.isnan(each.soc_pct) and np.isnan(each.age_s) for each in unknown)
@@ -149,16 +151,16 @@ def test_a_process_stopped_for_ten_minutes_knows_what_it_missed() -> None:
 
 
 def test_ends_after_duration_or_when_idle() -> None:
-    port = simulate(SimulatedPort([]), LoopSettings(duration_s=0.3, until_idle_s=0.1))
+    port = simulate(SimulatedPort([]), loop_config(duration_s=0.3, until_idle_s=0.1))
     assert port.since_s == pytest.approx(0.3, abs=0.1)  # idle before the first sample: no end
     frames = frames_every(0.1, 3.0, 1.0)
-    port = simulate(SimulatedPort(frames), LoopSettings(until_idle_s=0.5))
+    port = simulate(SimulatedPort(frames), loop_config(until_idle_s=0.5))
     assert port.since_s == pytest.approx(3.4, abs=0.11)
 
 
 def test_checkpoints_come_soon_periodically_and_at_the_end() -> None:
     port, asked = SimulatedPort([]), list[float]()
-    settings = LoopSettings(duration_s=2.6, checkpoint_every_s=1.2)
+    settings = loop_config(duration_s=2.6, state_every_s=1.2)
     simulate(port, settings, checkpoint=lambda: asked.append(port.since_s))
     assert asked == [pytest.approx(at_s, abs=0.11) for at_s in (1.0, 2.2, 2.6)]
 
@@ -180,7 +182,7 @@ def test_a_failing_output_and_an_idle_replay_clock_are_told_once(
 ) -> None:
     pipeline, failing, rows = Pipeline(GENERIC, leaf_model()), Failing(), Rows([])
     with virtual_port("fails", pipeline.filters) as port, virtual_port("fails") as sender:
-        loop = Loop(port, pipeline, outputs=[failing, rows])
+        loop = Loop(port, pipeline, loop_config(), outputs=[failing, rows])
         for frame in [*[ClockFrames().at(5_000_000)] * 3, *frames_of(short_log(2.0))]:
             sender.send(frame)
         loop.run(lambda: pipeline.samples == 20)
@@ -244,7 +246,9 @@ def test_a_lost_bus_ends_the_loop_with_one_line_and_saves_the_state(
     bus: BrokenBus, say: str
 ) -> None:
     port, saved = BusConnection(bus, "fake bus"), list[int]()  # type: ignore[arg-type] # has what is used
-    loop = Loop(port, Pipeline(GENERIC, leaf_model()), checkpoint=lambda: saved.append(1))
+    loop = Loop(
+        port, Pipeline(GENERIC, leaf_model()), loop_config(), checkpoint=lambda: saved.append(1)
+    )
     with pytest.raises(BusError, match=f"fake bus: {say}") as lost:
         loop.run(never)
     assert lost.value.exit_code == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import can
 
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.service.loop import LoopSettings, OwnFrames
+from cangauge.service.own_frames import OwnFrames
 from cangauge.service.pipeline import PipelineSettings
 from cangauge.types import Reason
 from live import frames_of, short_log, virtual_port, virtual_service, waits
@@ -21,14 +21,14 @@ def test_echoes_are_awaited_until_the_queue_was_empty_however_many_they_are() ->
     for number in range(5000):
         own.note_sent(own_frame(number), 0.001 * number)
     assert all(own.is_echo(own_frame(number)) for number in range(100))
-    own.forget(9.0)
+    own.forget(10.0)
     assert not own.is_echo(own_frame(5000 - 1025))
     assert own.is_echo(own_frame(5000 - 1024))  # a controller without an acknowledgement waits
 
 
 def test_the_end_after_a_silence_says_that_the_estimate_is_stale() -> None:
     known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
-    service = virtual_service("silent end", known, LoopSettings(timeout_s=0.2))
+    service = virtual_service("silent end", known, timeout_s=0.2)
     with virtual_port("silent end") as port, service:
         for frame in frames_of(short_log(1.0)):
             port.send(frame)

@@ -56,7 +56,7 @@ def expected(messages: list[can.Message]) -> list[tuple[int, int, bytes]]:
 
 def write(recorder: Recorder, messages: list[can.Message]) -> None:
     for number, message in enumerate(messages):
-        recorder.write(message)
+        recorder.on_frame(message)
         if number % 50 == 49:
             recorder.on_snapshot(SNAPSHOT)
     recorder.on_snapshot(SNAPSHOT)
@@ -69,7 +69,7 @@ def live_and_recorded(
     live = []
     with Recorder(path, part_bytes) as recorder:
         for number, message in enumerate(messages):
-            recorder.write(message)
+            recorder.on_frame(message)
             if part_bytes and number % 100 == 0:
                 recorder.on_snapshot(SNAPSHOT)
                 assert waits(recorder._worker._jobs.empty)
@@ -132,7 +132,7 @@ def test_a_recorded_replay_uses_the_logs_time(tmp_path: Path) -> None:
 
 def test_a_capture_of_another_bus_is_refused(tmp_path: Path) -> None:
     with Recorder(tmp_path / "other.log") as recorder:
-        recorder.write(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
+        recorder.on_frame(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
     with pytest.raises(InputError, match="no sample"):
         estimate_capture(recorder.written, Vehicle.load("generic"), leaf_model())
 
@@ -170,7 +170,7 @@ def test_an_old_part_that_cannot_be_removed_ends_no_start(tmp_path: Path) -> Non
     (tmp_path / "r-0001-000002.log").write_bytes(bytes(2000))
     with LoggedLines("cangauge.service.record") as logged:
         recorder = Recorder(tmp_path / "r.log", 1000.0, 1000.0)
-        recorder.write(can.Message())
+        recorder.on_frame(can.Message())
         recorder.close()
     assert recorder.state.lost_frames == 1
     assert any("writing is retried" in line for line in logged.lines)
@@ -275,7 +275,7 @@ from cangauge.service.record import Recorder
 from cangauge.service.status_client import Snapshot
 with Recorder(sys.argv[1]) as recorder:
     for number in range(100_000):
-        recorder.write(can.Message(
+        recorder.on_frame(can.Message(
             timestamp=1.7e9 + 0.001 * number, arbitration_id=0x123, data=number.to_bytes(8, "big")
         ))
         if number % 50 == 49:

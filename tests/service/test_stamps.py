@@ -18,12 +18,11 @@ from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder
 from cangauge.types import Reason, Sample, Status
-from live import LoggedLines, Rows, frames_of, leaf_model, short_log
+from live import LoggedLines, Rows, frames_of, leaf_model, loop_config, short_log
 
 GENERIC = Vehicle.load("generic")
 KERNEL = BackendCapabilities("kernel", echoes=False, has_error_classes=False)
@@ -41,7 +40,7 @@ def run(
     port.capabilities = KERNEL
     pipeline, rows = Pipeline(GENERIC, leaf_model(), GIVEN), Rows([])
     with Recorder(path) as recorder, LoggedLines("cangauge.service.loop") as logged:
-        simulate(port, seconds, pipeline, record=recorder, outputs=[rows, recorder])
+        simulate(port, seconds, pipeline, outputs=[rows, recorder])
     recorded = estimate_capture(path, GENERIC, leaf_model(), GIVEN.estimator).table
     assert recorded.soc_pct.tolist() == [each.soc_pct for _, each in rows.rows]
     assert recorded.reasons.tolist() == [int(each.reasons) for _, each in rows.rows]
@@ -97,7 +96,7 @@ def test_samples_that_are_refused_do_not_make_it_fresh() -> None:
         for message in (clock.at(min(round(at_s * 1e6), 1_000_000)), frame)
     ]
     pipeline = Pipeline(GENERIC, leaf_model(), replace(GIVEN, time_source="replay-clock"))
-    settings = LoopSettings(timeout_s=0.3, duration_s=4.0)
+    settings = loop_config(timeout_s=0.3, duration_s=4.0)
     last = simulate(SimulatedPort(frames), settings, pipeline).published[-1][1]
     assert pipeline.samples > pipeline.taken + 30
     assert last.status is Status.INVALID

@@ -28,10 +28,9 @@ from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Reason, Status
-from live import Command, Service, leaf_model, leaf_model_path, short_log, waits
+from live import Command, Service, leaf_model, leaf_model_path, loop_config, short_log, waits
 
 pytestmark = pytest.mark.socketcan
 
@@ -73,7 +72,7 @@ class Reconnecting(Service):
         self.log = BusLog()
         port = ReconnectingBus(address, pipeline.filters)
         port.open(wait=wait)
-        super().__init__(port, pipeline, LoopSettings(timeout_s=STALE_S))
+        super().__init__(port, pipeline, loop_config(timeout_s=STALE_S))
 
     def __enter__(self) -> Self:
         self.log.__enter__()

@@ -49,10 +49,10 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
         BusConnection(open_bus(VCAN, []), "sender") as sender,
         Recorder(tmp_path / "seen.log", part_bytes=5_000) as recorder,
     ):
-        monitor = Monitor(pipeline, port, record=lambda: recorder.state)
+        monitor = Monitor(pipeline, port, recorder=recorder)
         server = Served(Offer(http=http_address("127.0.0.1:0", None, {})), monitor.latest)
         outputs = [Rows(rows), recorder, Shown(server)]
-        loop = Loop(port, pipeline, outputs=outputs, record=recorder, monitor=monitor)
+        loop = Loop(port, pipeline, outputs=outputs, monitor=monitor)
         thread = threading.Thread(target=loop.run, args=(stop.is_set,))
         thread.start()
         with closing(server):

@@ -24,7 +24,6 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantization_bound
-from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder
@@ -33,6 +32,7 @@ from live import (
     Service,
     leaf_model,
     leaf_model_path,
+    loop_config,
     never,
     run_to_end,
     same_frames,
@@ -62,7 +62,7 @@ def replay_port() -> Iterator[BusConnection]:
 def service(preset: str, settings: PipelineSettings, record: Recorder | None = None) -> Service:
     pipeline = Pipeline(Vehicle.load(preset), leaf_model(), settings)
     return Service(
-        BusConnection(open_bus(VCAN, pipeline.filters), str(VCAN)), pipeline, LoopSettings(), record
+        BusConnection(open_bus(VCAN, pipeline.filters), str(VCAN)), pipeline, loop_config(), record
     )
 
 

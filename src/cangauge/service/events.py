@@ -6,13 +6,12 @@ import json
 import logging
 import math
 import select
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import IO, Any, Final, Literal, TextIO
+from typing import IO, Final, Literal, TextIO
 
 from cangauge._text import plain, printable, printable_json
 
@@ -42,16 +41,30 @@ def _created(held: tuple[_Repetitions, logging.LogRecord]) -> float:
     return held[1].created
 
 
-class RateLimitedHandler(logging.Handler):
-    """Limit each event to one record per interval; the latest suppressed one follows at its end.
+class RateLimitedHandler(logging.StreamHandler[TextIO]):
+    """Write each event at most once per interval, as a line of text or as a JSON object.
 
-    It follows when `release_due` is called: no thread is started for it, which could fail. A
-    record's `suppressed` counts those of its event that were dropped before it. `clock` gives
-    monotonic time [s].
+    The latest suppressed record of an event is written by `release_due` once its interval has
+    ended. It says how many were suppressed. A reader that has stopped costs lines: the service
+    never waits for it.
+
+    Parameters
+    ----------
+    log_format : {"text", "json"}
+    stream : file, optional
+        Default: stderr.
+    clock : callable
+        Monotonic time [s].
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__()
+    def __init__(
+        self,
+        log_format: LogFormat = "text",
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(stream)
+        self._log_format = log_format
         self._clock = clock
         self._events: dict[tuple[str, str], _Repetitions] = {}
 
@@ -85,6 +98,43 @@ class RateLimitedHandler(logging.Handler):
                     event.suppressed -= 1
                     self._write(event, record, now_s)
 
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record; drop it if the stream's reader has stopped."""
+        if takes_text(self.stream):
+            super().emit(record)
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return a record as one line, such as `TIME WARNING bus.lost: can0 is down (retry_s=1)`.
+
+        As JSON it is an object with `time`, `level`, `event`, `message`, `logger` and the fields.
+        The event of other libraries is "log".
+        """
+        stamp = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        time_text, event = stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log"))
+        message, fields = record.getMessage(), dict(getattr(record, "fields", {}))
+        if record.exc_info is not None:
+            message = f"{message}: {record.exc_info[1]!r}"
+        if hasattr(record, "suppressed"):
+            fields["repeats_suppressed"] = record.suppressed
+        if self._log_format == "json":
+            content = plain(fields) | {
+                "time": time_text,
+                "level": record.levelname.lower(),
+                "event": event,
+                "message": message,
+                "logger": record.name,
+            }
+            return printable_json(json.dumps(content, ensure_ascii=False, default=str))
+        pairs = " ".join(
+            f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
+            for name, value in fields.items()
+        )
+        line = f"{time_text} {record.levelname} {event}: {message}"
+        return printable(" ".join((f"{line} ({pairs})" if pairs else line).splitlines()))
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
+
     def _write(self, event: _Repetitions, record: logging.LogRecord, now_s: float) -> None:
         if event.suppressed:
             record.suppressed = event.suppressed
@@ -92,16 +142,6 @@ class RateLimitedHandler(logging.Handler):
         event.interval_s = min(2.0 * event.interval_s, LONGEST_INTERVAL_S) or FIRST_INTERVAL_S
         event.next_s = now_s + event.interval_s
         self.emit(record)
-
-
-class _Handler(RateLimitedHandler, logging.StreamHandler[TextIO]):
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write a record; drop it if its reader is stopped, instead of waiting."""
-        if takes_text(self.stream):
-            super().emit(record)
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
 
 
 @contextmanager
@@ -112,9 +152,7 @@ def logging_to(
 
     `level` is the lowest one written; other libraries are limited to errors, unless it is "debug".
     """
-    handler = _Handler()
-    handler.stream = stream or sys.stderr
-    handler.setFormatter(_JsonFormat() if log_format == "json" else _TextFormat())
+    handler = RateLimitedHandler(log_format, stream)
     # python-can logs and raises the same error, at each attempt to open a missing bus.
     levels: dict[str, int | str] = {
         "": logging.ERROR,
@@ -157,43 +195,3 @@ def takes_text(stream: IO[str]) -> bool:
         return bool(ready.poll(0))
     except (AttributeError, OSError, ValueError):  # Windows; no real file
         return True
-
-
-class _TextFormat(logging.Formatter):
-    """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1)`."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        time_text, event, message, fields = _parts(record)
-        pairs = " ".join(
-            f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
-            for name, value in fields.items()
-        )
-        line = f"{time_text} {record.levelname} {event}: {message}"
-        return printable(" ".join((f"{line} ({pairs})" if pairs else line).splitlines()))
-
-
-class _JsonFormat(logging.Formatter):
-    """One JSON object per line: `time`, `level`, `event`, `message`, `logger` and the fields."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        time_text, event, message, fields = _parts(record)
-        content = plain(fields) | {
-            "time": time_text,
-            "level": record.levelname.lower(),
-            "event": event,
-            "message": message,
-            "logger": record.name,
-        }
-        return printable_json(json.dumps(content, ensure_ascii=False, default=str))
-
-
-def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
-    """Return time, event ("log" of other libraries), message and fields of a record."""
-    stamp = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-    message = record.getMessage()
-    if record.exc_info is not None:
-        message = f"{message}: {record.exc_info[1]!r}"
-    fields = dict(getattr(record, "fields", {}))
-    if hasattr(record, "suppressed"):
-        fields["repeats_suppressed"] = record.suppressed
-    return stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log")), message, fields

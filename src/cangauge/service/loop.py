@@ -1,8 +1,7 @@
 """The service's loop: receive frames, hand them to the pipeline, send its frames.
 
 Only the loop reads a clock, a monotonic one: to publish periodically, to detect stale input, and
-to replace time stamps that cannot be true. It also detects another sender of the service's own ids,
-which would make the published SoC jump between two values.
+to replace time stamps that cannot be true.
 """
 
 from __future__ import annotations
@@ -10,9 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -20,7 +17,6 @@ import can
 
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.decoder import SUSPECTED_FOR_S
 from cangauge.bus.publish import ESTIMATE_EVERY_S, standard_filter
 from cangauge.bus.time_source import (
     DRIVER_TOLERANCE_S,
@@ -30,10 +26,11 @@ from cangauge.bus.time_source import (
     log_time_us,
     steady_s,
 )
+from cangauge.service.config import RunConfig
 from cangauge.service.output import Output
+from cangauge.service.own_frames import OwnFrames
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.polling import Poller
-from cangauge.service.record import Recorder
 from cangauge.service.status import Monitor
 from cangauge.types import Estimate, Reason
 
@@ -43,49 +40,12 @@ _warn = partial(emit, _LOG, logging.WARNING)
 LATE_S: Final = 0.01
 """Longest delay of periodic frames for a sample that is due, and shortest interval of housekeeping
 under continuous traffic [s]."""
-LONGEST_WAIT_S: Final = 0.1
-"""Longest wait for frames, and longest interval of housekeeping [s]."""
-SEND_WITHIN_S: Final = 0.1
-"""Longest time that a frame waits for room in the transmit queue [s]: until the next one is due.
-The loop itself never waits: a full queue (no other node on the bus) costs frames, not the
-estimate."""
 LOGGED_FROM_S: Final = 1.0
 """Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
-CHECKPOINT_EVERY_S: Final = 10.0
-"""Interval of checkpoints [s]. A service that is killed and restarts within three seconds misses
-less than half a minute of charge; 20 kB per checkpoint make 0.2 GB a day."""
 NEVER_SEEN_S: Final = 60.0
 """Time after which a signal that never came is logged [s]: replies are asked for once a minute."""
 FIRST_CHECKPOINT_S: Final = 1.0
 """Time of the first checkpoint [s]: early, for a service that is killed repeatedly."""
-FOREIGN_FRAMES: Final = 3
-FOREIGN_WITHIN_S: Final = 5.0
-"""Foreign frames with own ids within this time [s] that prove another sender."""
-_ECHOES_KEPT: Final = 1024
-"""Latest own frames whose echoes are always awaited: they wait on a bus without a receiver."""
-ECHO_WITHIN_S: Final = 1.0
-"""Time after which the echo of a sent frame has arrived [s], transmit queue included. It may wait
-longer in the receive queue."""
-
-
-def do_nothing() -> None:
-    """Do nothing: neither a state is written nor a configuration read."""
-
-
-@dataclass(frozen=True)
-class LoopSettings:
-    """Time-outs of the loop [s].
-
-    Without a sample for `timeout_s` the estimate is published as stale. The loop ends after
-    `duration_s`, or after a silence of `until_idle_s` that follows samples. Checkpoints come every
-    `checkpoint_every_s`; replies over ISO-TP are asked for every `poll_every_s`.
-    """
-
-    timeout_s: float = 2.0
-    duration_s: float | None = None
-    until_idle_s: float | None = None
-    checkpoint_every_s: float = CHECKPOINT_EVERY_S
-    poll_every_s: float | None = None
 
 
 class Loop:
@@ -95,35 +55,31 @@ class Loop:
     ----------
     port : BusConnection
     pipeline : Pipeline
-    settings : LoopSettings, optional
+    config : RunConfig
+        Its time-outs, and the intervals of checkpoints and of requests over ISO-TP.
     outputs : sequence of Output
-    record : Recorder, optional
-        Takes every received frame that is input; one of the outputs as well.
     monitor : Monitor, optional
     checkpoint : callable, optional
-        Starts to save the state: every `checkpoint_every_s`, and at the end.
+        Starts to save the state: every `state_every_s`, and at the end.
     reload : callable, optional
-        Called at least every `LONGEST_WAIT_S`; returns the loop's new settings once the pipeline
-        has another configuration.
+        Called every `ESTIMATE_EVERY_S` or sooner; returns the new configuration once the pipeline
+        uses it.
     """
 
     def __init__(
         self,
         port: BusConnection,
         pipeline: Pipeline,
-        settings: LoopSettings | None = None,
+        config: RunConfig,
         *,
         outputs: Sequence[Output] = (),
-        record: Recorder | None = None,
         monitor: Monitor | None = None,
-        checkpoint: Callable[[], None] = do_nothing,
-        reload: Callable[[], LoopSettings | None] = do_nothing,
+        checkpoint: Callable[[], None] | None = None,
+        reload: Callable[[], RunConfig | None] | None = None,
     ) -> None:
-        self._port, self._pipeline = port, pipeline
-        self._settings = settings or LoopSettings()
+        self._port, self._pipeline, self._config = port, pipeline, config
         self._outputs = list(outputs)
-        self._samplers = [each for each in outputs if type(each).on_sample is not Output.on_sample]
-        self._record = record
+        self._sort_outputs()
         self._monitor = monitor or Monitor(pipeline, port)
         self._checkpoint, self._reload = checkpoint, reload
         self._own = OwnFrames(echoes=port.capabilities.echoes)
@@ -142,30 +98,29 @@ class Loop:
         self._poller: Poller | None = None
         self._configure()
         self._began_s = self._now_s = self._publish_s = self._keep_s = time.monotonic()
-        self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, self._settings.checkpoint_every_s)
+        self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, config.state_every_s)
         # Times at which the latest sample was processed and received. They differ while frames wait
         # in the socket, after the process was suspended or under load.
         self._sample_s = self._came_s = self._began_s
 
     def _configure(self) -> None:
         """Poll and receive for the pipeline's present vehicle, and what shows other senders."""
-        pipeline, every_s = self._pipeline, self._settings.poll_every_s
+        pipeline, poll = self._pipeline, self._config.poll
         targets, ids = pipeline.vehicle.poll_targets, pipeline.settings.ids
         asked_s = {} if self._poller is None else self._poller.asked_s
         self._poller = None
-        if every_s is not None and targets:
-            self._poller = Poller(targets, every_s, asked_s)
-        self._monitor.polls = None if self._poller is None else self._poller.counts
         not_input = set(ids.published)
-        if self._poller is not None:
+        if poll is not None and targets:
+            self._poller = Poller(targets, poll.every_s, asked_s)
             not_input |= self._poller.request_ids
+        self._monitor.polls = None if self._poller is None else self._poller.counts
         if not pipeline.is_replay:
             not_input.add(ids.replay_clock)
         self._not_input = frozenset(not_input)
         self._port.set_filters([*pipeline.filters, *map(standard_filter, sorted(not_input))])
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Receive, estimate and publish until `stop()`, called at least every `LONGEST_WAIT_S`.
+        """Receive, estimate and publish until `stop()`, called every `ESTIMATE_EVERY_S` or sooner.
 
         Raises
         ------
@@ -181,10 +136,10 @@ class Loop:
                 self._now_s = time.monotonic()
                 self._publish_periodic()  # a sample that waited counts as silence
         finally:
-            self._checkpoint()
+            self._save()
 
     def _is_over(self) -> bool:
-        duration_s, idle_s = self._settings.duration_s, self._settings.until_idle_s
+        duration_s, idle_s = self._config.duration_s, self._config.until_idle_s
         is_late = duration_s is not None and self._now_s - self._began_s >= duration_s
         is_idle = idle_s is not None and self._now_s - self._sample_s >= idle_s
         return is_late or (is_idle and self._pipeline.samples > 0)
@@ -192,15 +147,15 @@ class Loop:
     def _iterate(self) -> None:
         """Receive once, process the frames, and do what is due."""
         left_s = self._publish_s + LATE_S - self._now_s
-        messages = self._port.receive_pending(min(max(left_s, 0.0), LONGEST_WAIT_S))
+        messages = self._port.receive_pending(min(max(left_s, 0.0), ESTIMATE_EVERY_S))
         # Reading the clock may be a system call: once per step, and again after samples.
         self._now_s, before, received_s = time.monotonic(), self._pipeline.samples, steady_s()
         if messages:
             self._process(messages, received_s)
         if self._port.is_drained:
             self._drained_s = self._received_s
-            for own in (self._own, self._asked):
-                own.forget(self._received_s - ECHO_WITHIN_S)
+            self._own.forget(self._received_s)
+            self._asked.forget(self._received_s)
         self._received_s = received_s
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
         if self._now_s >= self._publish_s + late_s:
@@ -211,22 +166,25 @@ class Loop:
             self._keep_s = self._now_s + LATE_S
             self._housekeep()
 
+    # --- frames → estimates
+
     def _process(self, messages: list[can.Message], now_s: float) -> None:
-        pipeline, record, poller = self._pipeline, self._record, self._poller
+        """Estimate from frames received at a steady time [s]."""
+        pipeline, poller = self._pipeline, self._poller
         samples_before, taken_before, stamp_s = pipeline.samples, pipeline.taken, math.nan
         stamps = [message.timestamp for message in messages]
         lag_s = now_s - self._stamps.limit(messages, self._drained_s, now_s)
         for message, received_s in zip(messages, stamps, strict=True):
             if message.arbitration_id in self._not_input and self._is_not_input(message):
                 continue
-            if record is not None:
-                record.write(message)
+            for output in self._frame_outputs:
+                self._give(output, "on_frame", message)
             if poller is not None and message.arbitration_id in poller.reply_ids:
                 self._ask(poller.take(message, self._now_s))
             if not pipeline.handle(message):
                 continue
             stamp_s = received_s
-            if self._samplers or pipeline.is_replay:
+            if self._sample_outputs or pipeline.is_replay:
                 estimate = pipeline.latest
                 self._give_sample(estimate)
                 if frames := pipeline.acknowledgement(estimate):
@@ -262,8 +220,13 @@ class Loop:
             _warn("bus.replay_clock_ignored", f"{text} --time-source replay-clock")
         return True
 
+    def _sort_outputs(self) -> None:
+        """Note the outputs that take frames, and those that take samples."""
+        self._frame_outputs = [each for each in self._outputs if overrides(each, "on_frame")]
+        self._sample_outputs = [each for each in self._outputs if overrides(each, "on_sample")]
+
     def _give_sample(self, estimate: Estimate) -> None:
-        for output in self._samplers:
+        for output in self._sample_outputs:
             self._give(output, "on_sample", self._pipeline.latest_sample, estimate)
 
     def _give(self, output: Output, method: str, *news: object) -> None:
@@ -274,31 +237,48 @@ class Loop:
             name = type(output).__name__
             emit(_LOG, logging.ERROR, "output.failed", f"{name} has ended: {error!r}", limit=name)
             self._outputs = [each for each in self._outputs if each is not output]
-            self._samplers = [each for each in self._samplers if each is not output]
+            self._sort_outputs()
+
+    # --- estimates → frames
 
     def _publish_periodic(self) -> None:
         silent_s, reasons = self._now_s - self._came_s, self._report_findings()
-        self._send(self._pipeline.heartbeat(silent_s, self._settings.timeout_s, reasons))
+        self._send(self._pipeline.heartbeat(silent_s, self._config.timeout_s, reasons))
         # Stay on the clock's grid; skip those missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._publish_s) / ESTIMATE_EVERY_S), 0)
         self._publish_s += (missed + 1) * ESTIMATE_EVERY_S
 
     def _report_findings(self) -> Reason:
-        """Log what is new about time and other senders; return the reasons to publish."""
-        stamps, reasons, found = self._stamps, Reason.NONE, {}
-        if stamps.shift_s != self._shift_s:
-            step_s, self._shift_s = self._shift_s - stamps.shift_s, stamps.shift_s
-            self._pipeline.stamp_shift_s = stamps.shift_s
-            if abs(step_s) >= LOGGED_FROM_S:
-                text = f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
-                _warn("bus.clock_set", f"{text} the monotonic clock", step_s=step_s)
-        if stamps.is_uncertain(steady_s()):
+        """Log what is new about time, senders and signals; return the reasons to publish."""
+        self._follow_clock()
+        reasons, found = Reason.NONE, self._find_in_signals()
+        if self._stamps.is_uncertain(steady_s()):
             reasons |= Reason.TIME_UNCERTAIN
             text = "the time stamps of the frames contradict the monotonic clock; the time of"
             found["bus.time_uncertain"] = f"{text} receiving is used instead"
         if self._own.is_shared(self._now_s):
             reasons |= Reason.DUPLICATE_SENDER
-        for name in self._pipeline.decoder.two_sender_messages:
+        if self._pipeline.decoder.unsigned_current is not None:
+            reasons |= Reason.IMPLAUSIBLE_INPUT
+        for event in found.keys() - self._reported:
+            _warn(event.split()[0], found[event], limit=event)
+        self._reported = set(found)
+        return reasons
+
+    def _follow_clock(self) -> None:
+        """Let the pipeline follow a step of the stamps' clock, and log it."""
+        if self._stamps.shift_s == self._shift_s:
+            return
+        step_s, self._shift_s = self._shift_s - self._stamps.shift_s, self._stamps.shift_s
+        self._pipeline.stamp_shift_s = self._shift_s
+        if abs(step_s) >= LOGGED_FROM_S:
+            text = f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
+            _warn("bus.clock_set", f"{text} the monotonic clock", step_s=step_s)
+
+    def _find_in_signals(self) -> dict[str, str]:
+        """Return what is wrong with the vehicle's signals: a sentence by event."""
+        decoder, found = self._pipeline.decoder, dict[str, str]()
+        for name in decoder.two_sender_messages:
             found[f"bus.two_senders {name}"] = (
                 f"two senders use the id of {name}: its frames are refused until one of them"
                 " stops; is somebody else on the bus? (If one sender sends it more often than"
@@ -311,28 +291,24 @@ class Loop:
                 f"voltages come, but not within {within_s:g} s of a current: they are not used;"
                 " give a longer pair_within_s in the map file"
             )
-        if (unsigned := self._pipeline.decoder.unsigned_current) is not None:
-            reasons |= Reason.IMPLAUSIBLE_INPUT
-            found["bus.unsigned_current"] = unsigned
-        found |= self._of_signals()
-        for event in found.keys() - self._reported:
-            _warn(event.split()[0], found[event], limit=event)
-        self._reported = set(found)
-        return reasons
-
-    def _of_signals(self) -> dict[str, str]:
-        """Return what is wrong with single signals, by event."""
-        decoder = self._pipeline.decoder
-        found = {f"bus.wrong_period {name}": text for name, text in decoder.wrong_periods.items()}
+        if decoder.unsigned_current is not None:
+            found["bus.unsigned_current"] = decoder.unsigned_current
+        for name, text in decoder.wrong_periods.items():
+            found[f"bus.wrong_period {name}"] = text
         if self._now_s - self._began_s > NEVER_SEEN_S:
-            never = decoder.never_decoded.items()
-            found |= {f"bus.never_seen {role}": text for role, text in never}
+            for role, text in decoder.never_decoded.items():
+                found[f"bus.never_seen {role}"] = text
         return found
 
     def _send(self, frames: list[can.Message]) -> None:
+        """Send estimates; a frame waits for room in the transmit queue until the next is due.
+
+        The loop never waits: a full queue (no other node on the bus) costs frames, not the
+        estimate.
+        """
         for frame in frames:
             self._own.note_sent(frame, steady_s())
-            self._port.post(frame, SEND_WITHIN_S)
+            self._port.post(frame, ESTIMATE_EVERY_S)
         if frames:
             self._monitor.sent()
 
@@ -340,7 +316,13 @@ class Loop:
         """Send a request or a flow control, if there is one."""
         if frame is not None:
             self._asked.note_sent(frame, steady_s())
-            self._port.post(frame, SEND_WITHIN_S)
+            self._port.post(frame, ESTIMATE_EVERY_S)
+
+    # --- housekeeping
+
+    def _save(self) -> None:
+        if self._checkpoint is not None:
+            self._checkpoint()
 
     def _housekeep(self) -> None:
         """Report lost frames, save, reload and show."""
@@ -350,74 +332,17 @@ class Loop:
             text = f"{self._port.name}: the receive queue overflowed: {lost} frames lost"
             _warn("bus.queue_overflow", f"{text} ({drops} so far)")
         if now_s >= self._save_s:
-            self._save_s = now_s + self._settings.checkpoint_every_s
-            self._checkpoint()
-        if (settings := self._reload()) is not None:
-            self._settings = settings
-            self._save_s = min(self._save_s, now_s + settings.checkpoint_every_s)
+            self._save_s = now_s + self._config.state_every_s
+            self._save()
+        if self._reload is not None and (config := self._reload()) is not None:
+            self._config = config
+            self._save_s = min(self._save_s, now_s + config.state_every_s)
             self._configure()
         if self._monitor.update(now_s):
             for output in self._outputs:
                 self._give(output, "on_snapshot", self._monitor.latest)
 
 
-class OwnFrames:
-    """Tell own frames that a bus returns from those of another sender with the same ids.
-
-    Parameters
-    ----------
-    echoes : bool
-        Whether the bus returns own frames (see `BackendCapabilities`).
-
-    Attributes
-    ----------
-    foreign : int
-        Number of frames from another sender.
-    """
-
-    def __init__(self, *, echoes: bool) -> None:
-        self.foreign = 0
-        self._echoes = echoes
-        self._sent: deque[tuple[int, bytes]] = deque()
-        self._sent_s: deque[float] = deque()
-        self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
-        self._shared_until_s = -math.inf
-
-    def note_sent(self, message: can.Message, now_s: float) -> None:
-        """Record an own frame, whose echo may be received, and the steady time [s]."""
-        if self._echoes:
-            self._sent.append((message.arbitration_id, bytes(message.data)))
-            self._sent_s.append(now_s)
-
-    def forget(self, before_s: float) -> None:
-        """Await no echo of what was sent before a steady time [s], but of the latest frames."""
-        while len(self._sent) > _ECHOES_KEPT and self._sent_s[0] < before_s:
-            self._sent_s.popleft()
-            self._sent.popleft()
-
-    def is_echo(self, message: can.Message) -> bool:
-        """Return whether a received frame is the echo of an own one, which is then forgotten."""
-        frame = (message.arbitration_id, bytes(message.data))
-        if frame not in self._sent:
-            return False
-        # Each echo comes once and in order; skipped ones are lost. So identical frames of another
-        # sender are detected as well: as surplus echoes.
-        is_found = False
-        while not is_found:
-            self._sent_s.popleft()
-            is_found = self._sent.popleft() == frame
-        return True
-
-    def proves_another(self, now_s: float) -> bool:
-        """Count a foreign frame; return whether there are enough, at a monotonic time [s]."""
-        self.foreign += 1
-        self._foreign_s.append(now_s)
-        is_recent = now_s - self._foreign_s[0] <= FOREIGN_WITHIN_S
-        is_proven = is_recent and len(self._foreign_s) == FOREIGN_FRAMES
-        if is_proven:
-            self._shared_until_s = now_s + SUSPECTED_FOR_S
-        return is_proven
-
-    def is_shared(self, now_s: float) -> bool:
-        """Return whether another sender was proven lately, at a monotonic time [s]."""
-        return now_s < self._shared_until_s
+def overrides(output: Output, method: str) -> bool:
+    """Return whether an output does anything with what a method would give it."""
+    return getattr(type(output), method) is not getattr(Output, method)

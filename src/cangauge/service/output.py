@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Self
 
-from cangauge.types import Estimate, Sample
-
 if TYPE_CHECKING:
+    import can
+
     from cangauge.service.status_client import Snapshot
+    from cangauge.types import Estimate, Sample
 
 
 class Output:
@@ -19,6 +20,9 @@ class Output:
     """
 
     trouble = ""
+
+    def on_frame(self, message: can.Message) -> None:
+        """Take a received frame that is input, before the estimator; its stamp may be rounded."""
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
         """Take a sample and the estimate after it."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Final
 
 import can
@@ -16,39 +15,22 @@ import can
 from cangauge.bus.isotp import CONSECUTIVE, FIRST, PollTarget, Reassembler
 
 REPLY_WITHIN_S: Final = 1.0
+"""Longest wait for the next frame of a reply [s]: N_Cr of ISO 15765-2."""
 EXCHANGE_WITHIN_S: Final = 5.0
-"""Wait for the next frame of a reply [s]: N_Cr of ISO 15765-2; from a request to its whole reply,
-also after "response pending": P2* of ISO 14229-2."""
+"""Longest time from a request to its whole reply, also after "response pending" [s]: P2* of
+ISO 14229-2."""
 BETWEEN_S: Final = 0.05
+"""Shortest pause between an exchange and the next request [s]: P2 of ISO 14229-2."""
 PER_NODE_S: Final = 1.0
-"""Shortest wait from the end of an exchange to the next request: P2 of ISO 14229-2; interval of the
-requests to one node, whatever it answers [s]: drivers' apps ask a node as often."""
+"""Shortest interval of the requests to one node, whatever it answers [s], as of drivers' apps."""
 SLOWEST_S: Final = 60.0
+"""Longest interval of the requests for a reply that does not come [s]."""
 OTHER_TESTER_S: Final = 30.0
-"""Longest interval between requests for a reply that does not come [s]: one a minute burdens no
-bus; silence of another tester after which requests are sent again: drivers' apps ask often."""
+"""Silence of another tester after which requests are sent again [s]: drivers' apps ask often."""
 
 _NEGATIVE, _RESPONSE_PENDING = 0x7F, 0x78
 _CONTINUE: Final = bytes([0x30, 0x00, 0x00])
 """Flow control: continue to send, all frames, without a pause."""
-
-
-@dataclass(slots=True)
-class PollCounts:
-    """Outcomes of requests: negative ones are no answers; frames of another tester."""
-
-    requests: int = 0
-    answers: int = 0
-    negative: int = 0
-    unanswered: int = 0
-    other_tester: int = 0
-
-
-@dataclass(slots=True)
-class _Poll:
-    target: PollTarget
-    due_s: float = -math.inf
-    failures: int = 0
 
 
 class Poller:
@@ -65,7 +47,8 @@ class Poller:
 
     Attributes
     ----------
-    counts : PollCounts
+    counts : dict of str to int
+        Requests by outcome: negative ones are no answers. Frames of another tester.
     request_ids, reply_ids : frozenset of int
     """
 
@@ -75,46 +58,46 @@ class Poller:
         every_s: float,
         asked_s: dict[int, float] | None = None,
     ) -> None:
-        self._polls = [_Poll(target) for target in targets]
+        self._due_s = dict.fromkeys(targets, -math.inf)
+        self._failures = dict.fromkeys(self._due_s, 0)  # in a row
         self._every_s = every_s
         self.asked_s = asked_s or {}
-        self._waiting: _Poll | None = None
+        self._awaited: PollTarget | None = None
         self._give_up_s = self._exchange_ends_s = math.inf
         self._quiet_until_s = -math.inf
         self._may_continue = False
         self._reassembler = Reassembler()
-        self.counts = PollCounts()
-        self.request_ids = frozenset(poll.target.request_id for poll in self._polls)
-        self.reply_ids = frozenset(poll.target.reply_id for poll in self._polls)
+        outcomes = ("requests", "answers", "negative", "unanswered", "other_tester")
+        self.counts = dict.fromkeys(outcomes, 0)
+        self.request_ids = frozenset(target.request_id for target in self._due_s)
+        self.reply_ids = frozenset(target.reply_id for target in self._due_s)
 
     def due(self, now_s: float) -> can.Message | None:
         """Return the request to send, if one is due."""
-        if self._waiting is not None:
+        if self._awaited is not None:
             if now_s < self._give_up_s:
                 return None
-            self.counts.unanswered += 1
-            self._end(self._waiting, now_s, failed=True)
-        poll = min(self._polls, key=self._next_s)
-        if now_s < max(self._next_s(poll), self._quiet_until_s):
+            self.counts["unanswered"] += 1
+            self._end(self._awaited, now_s, failed=True)
+        target = min(self._due_s, key=self._next_s)
+        if now_s < max(self._next_s(target), self._quiet_until_s):
             return None
-        self.asked_s[poll.target.request_id] = now_s
-        self._waiting, self._give_up_s = poll, now_s + REPLY_WITHIN_S
+        self.asked_s[target.request_id] = now_s
+        self._awaited, self._give_up_s = target, now_s + REPLY_WITHIN_S
         self._exchange_ends_s, self._may_continue = now_s + EXCHANGE_WITHIN_S, True
         self._reassembler = Reassembler()
-        self.counts.requests += 1
-        request = poll.target.request
-        return _frame(poll.target.request_id, bytes([len(request)]) + request)
+        self.counts["requests"] += 1
+        return _frame(target.request_id, bytes([len(target.request)]) + target.request)
 
-    def _next_s(self, poll: _Poll) -> float:
-        last_s = self.asked_s.get(poll.target.request_id, -math.inf)
-        return max(poll.due_s, last_s + PER_NODE_S)
+    def _next_s(self, target: PollTarget) -> float:
+        last_s = self.asked_s.get(target.request_id, -math.inf)
+        return max(self._due_s[target], last_s + PER_NODE_S)
 
     def take(self, message: can.Message, now_s: float) -> can.Message | None:
         """Take a frame of a reply; return the flow control to send."""
-        poll = self._waiting
-        if poll is None or message.arbitration_id != poll.target.reply_id or not message.data:
+        target = self._awaited
+        if target is None or message.arbitration_id != target.reply_id or not message.data:
             return None
-        target = poll.target
         reply = self._reassembler.take(message.data, now_s)
         if reply is None:
             kind = message.data[0] >> 4
@@ -125,30 +108,30 @@ class Poller:
                 self._may_continue = False
                 return _frame(target.request_id, _CONTINUE)
         elif reply.startswith(target.reply):
-            self.counts.answers += 1
-            self._end(poll, now_s, failed=False)
+            self.counts["answers"] += 1
+            self._end(target, now_s, failed=False)
         elif reply[:3] == bytes([_NEGATIVE, target.request[0], _RESPONSE_PENDING]):
             self._give_up_s = self._exchange_ends_s
         elif reply[:2] == bytes([_NEGATIVE, target.request[0]]):
-            self.counts.negative += 1
-            self._end(poll, now_s, failed=True)
+            self.counts["negative"] += 1
+            self._end(target, now_s, failed=True)
         return None
 
     def note_other_tester(self, now_s: float) -> None:
         """Pause, since a request came from somebody else."""
-        self.counts.other_tester += 1
+        self.counts["other_tester"] += 1
         self._quiet_until_s = now_s + OTHER_TESTER_S
-        if self._waiting is not None:
-            self._end(self._waiting, now_s, failed=False)
+        if self._awaited is not None:
+            self._end(self._awaited, now_s, failed=False)
 
-    def _end(self, poll: _Poll, now_s: float, *, failed: bool) -> None:
-        self._waiting = None
-        poll.failures = poll.failures + 1 if failed else 0
+    def _end(self, target: PollTarget, now_s: float, *, failed: bool) -> None:
+        self._awaited = None
+        self._failures[target] = self._failures[target] + 1 if failed else 0
         # The exponent is bounded: 2 to the number of failures of a week is no float.
-        wait_s = self._every_s * 2.0 ** min(poll.failures, 16)
-        poll.due_s = now_s + min(wait_s, max(SLOWEST_S, self._every_s))
-        for each in self._polls:
-            each.due_s = max(each.due_s, now_s + BETWEEN_S)
+        wait_s = self._every_s * 2.0 ** min(self._failures[target], 16)
+        self._due_s[target] = now_s + min(wait_s, max(SLOWEST_S, self._every_s))
+        for each, due_s in self._due_s.items():
+            self._due_s[each] = max(due_s, now_s + BETWEEN_S)
 
 
 def _frame(request_id: int, payload: bytes) -> can.Message:

@@ -17,6 +17,7 @@ import logging
 import os
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -29,7 +30,6 @@ from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
 from cangauge.errors import InputError
 from cangauge.service.output import Output
-from cangauge.service.status import RecordState
 from cangauge.service.status_client import Snapshot
 from cangauge.service.worker import Worker
 
@@ -44,6 +44,20 @@ CLOSE_WITHIN_S: Final = 0.6
 _RIGHTS: Final = 0o640
 """Of a recording: the group may read where and how the car was driven, others not."""
 _LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordState:
+    """Progress of a recording: its current file; frames, and those of them that were not written.
+
+    `problem` is why the disk rejects data at present.
+    """
+
+    path: str
+    frames: int = 0
+    lost_frames: int = 0
+    written_bytes: int = 0
+    problem: str | None = None
 
 
 class Recorder(Output):
@@ -84,12 +98,12 @@ class Recorder(Output):
         self._batch: list[can.Message] = []
         self._lost_frames = 0
         self._file = file = _RecordFile(Path(path), part_bytes, keep_bytes)
-        self.state = RecordState(str(file.current), 0, 0, 0, None)
+        self.state = RecordState(str(file.current))
         self.written = file.path
         self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
 
-    def write(self, message: can.Message) -> None:
-        """Record a received frame and round its stamp to the one that is written."""
+    def on_frame(self, message: can.Message) -> None:
+        """Record a frame, and round its stamp to the one that is written."""
         message.timestamp = whole_us(message.timestamp) / 1e6
         self._batch.append(copy.copy(message))
         if len(self._batch) >= BATCH_FRAMES:

@@ -21,13 +21,13 @@ from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.lifecycle import Notifier, reload_on_hangup, sole_writer, stop_on_signals
-from cangauge.service.loop import Loop, LoopSettings, do_nothing
+from cangauge.service.loop import Loop
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder, check_recording
 from cangauge.service.setup import Setup, address_of, read_setup
 from cangauge.service.state import StateKeeper, state_path
-from cangauge.service.status import Monitor, RecordState
+from cangauge.service.status import Monitor
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
 from cangauge.service.worker import start_thread
 
@@ -156,8 +156,8 @@ class Service:
                 port,
                 config.model,
                 notifier=notifier,
-                record=self._recording,
-                troubles=self._troubles,
+                recorder=self.recorder,
+                outputs=self._outputs,
                 sign_cure=self._setup.sign_cure,
             )
             self.endpoint = _serve_status(config, monitor, stack)
@@ -172,11 +172,10 @@ class Service:
             loop = Loop(
                 port,
                 pipeline,
-                _loop_settings(config),
+                config,
                 outputs=self._outputs,
-                record=self.recorder,
                 monitor=monitor,
-                checkpoint=do_nothing if keeper is None else keeper.checkpoint,
+                checkpoint=None if keeper is None else keeper.checkpoint,
                 reload=partial(self._poll_reload, monitor),
             )
             loop.run(self._is_done)
@@ -189,14 +188,8 @@ class Service:
     def _is_done(self) -> bool:
         return self._is_stopped
 
-    def _recording(self) -> RecordState | None:
-        return None if self.recorder is None else self.recorder.state
-
-    def _troubles(self) -> list[str]:
-        return [text for each in self._outputs if (text := each.trouble)]
-
-    def apply(self, new: Setup | CangaugeError) -> tuple[LoopSettings | None, str | None]:
-        """Use another configuration as a whole, or log why not; return its settings, or that.
+    def apply(self, new: Setup | CangaugeError) -> str | None:
+        """Use another configuration as a whole; else log and return why not.
 
         Model, vehicle, method, capacity, gaps, time-outs and published ids change at once; the SoC
         continues unless current or voltage are decoded otherwise, and the initial SoC is ignored.
@@ -210,13 +203,13 @@ class Service:
         except CangaugeError as error:
             text = f"new configuration refused, the old one stays: {error}"
             emit(_LOG, logging.WARNING, "config.refused", text)
-            return None, str(error)
+            return str(error)
         _log_changes(self._setup, new)
         self._setup, self.config = new, new.config
-        return _loop_settings(new.config), None
+        return None
 
-    def _poll_reload(self, monitor: Monitor) -> LoopSettings | None:
-        """Begin to read on request, in a thread; use what was read since the last call."""
+    def _poll_reload(self, monitor: Monitor) -> RunConfig | None:
+        """Begin to read on request, in a thread; return the new configuration once it is in use."""
         if self._reading is None:
             if self._is_reload_due:
                 self._is_reload_due = False
@@ -230,11 +223,11 @@ class Service:
             return None
         if not self._reading.done():
             return None
-        settings, problem = self.apply(self._reading.result())
+        problem = self.apply(self._reading.result())
         self._reading = None
         monitor.model, monitor.sign_cure = self.config.model, self._setup.sign_cure
         monitor.reload_ends(problem)
-        return settings
+        return self.config if problem is None else None
 
     def _log_end(self, status: dict[str, Any]) -> None:
         """Log the end of a run: its frames, losses and last SoC, and what is missing."""
@@ -280,16 +273,6 @@ def _recording_limits(config: RunConfig) -> list[float | None]:
     """Return the largest size of a part, and of all parts together [bytes]."""
     limits_mb = config.record_part_mb, config.record_keep_mb
     return [None if each is None else 1e6 * each for each in limits_mb]
-
-
-def _loop_settings(config: RunConfig) -> LoopSettings:
-    return LoopSettings(
-        timeout_s=config.timeout_s,
-        duration_s=config.duration_s,
-        until_idle_s=config.until_idle_s,
-        checkpoint_every_s=config.state_every_s,
-        poll_every_s=None if config.poll is None else config.poll.every_s,
-    )
 
 
 def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path | None:

@@ -10,10 +10,10 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields
 from itertools import accumulate
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from cangauge._logging import emit
 from cangauge._text import known_soc, plain
@@ -24,7 +24,6 @@ from cangauge.bus.publish import NO_REPORT
 from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.polling import PollCounts
 from cangauge.service.status_client import (
     BOUNDS_S,
     SCHEMA,
@@ -33,6 +32,10 @@ from cangauge.service.status_client import (
     reason_ids,
 )
 from cangauge.types import REASON_WORDS, Estimate, Reason, Status, reason_sentences
+
+if TYPE_CHECKING:
+    from cangauge.service.output import Output
+    from cangauge.service.record import Recorder
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,20 +58,6 @@ _REJECTS: Final = tuple(
     for each in fields(MessageStatistics)
     if each.name not in {"wanted", "counter_jumps", "frames_lost"}
 )
-
-
-@dataclass(frozen=True, slots=True)
-class RecordState:
-    """Progress of a recording: its current file; frames, and those of them that were not written.
-
-    `problem` is why the disk rejects data at present.
-    """
-
-    path: str
-    frames: int
-    lost_frames: int
-    written_bytes: int
-    problem: str | None
 
 
 class Histogram:
@@ -106,18 +95,14 @@ def _as_utf8(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
-def _no_recording() -> None:
-    """Return that nothing is recorded."""
-
-
 class Monitor:
     """Collect counts in the receive loop; its methods are for the loop's thread.
 
     `latest` is immutable, hence readable from any thread. `model` (name of the file) and
     `sign_cure` (what to change if the current has the wrong sign) follow the configuration.
     `foreign` (frames of others with the service's ids) and `polls` (outcomes of its requests) are
-    set by the loop. `record` returns the state of the recording, `troubles` what is wrong with the
-    outputs, `clock` monotonic time [s].
+    set by the loop. `recorder` is the recording, `outputs` have what is wrong with them, `clock`
+    gives monotonic time [s].
     """
 
     def __init__(
@@ -127,18 +112,18 @@ class Monitor:
         model: str = "",
         *,
         notifier: Notifier | None = None,
-        record: Callable[[], RecordState | None] = _no_recording,
-        troubles: Callable[[], list[str]] = list,
+        recorder: Recorder | None = None,
+        outputs: Sequence[Output] = (),
         clock: Callable[[], float] = time.monotonic,
         sign_cure: str = "set the other sign under [current] of the map file",
     ) -> None:
         self.model, self.sign_cure = model, sign_cure
         self.foreign = 0
-        self.polls: PollCounts | None = None
+        self.polls: dict[str, int] | None = None
         self._pipeline = pipeline
         self._port = port
         self._notifier = notifier or Notifier()
-        self._record, self._troubles = record, troubles
+        self._recorder, self._outputs = recorder, outputs
         self._clock = clock
         self._began_s = now_s = clock()
         self._latency = Histogram()
@@ -224,7 +209,8 @@ class Monitor:
         rejected = sum(count for name, count in rejects.items() if name not in _OF_VALUES)
         counts = {name: getattr(port, name, None) for name in BUS_COUNTS}
         counts["foreign"] = self.foreign
-        record = self._record()
+        record = None if self._recorder is None else self._recorder.state
+        troubles = [text for each in self._outputs if (text := each.trouble)]
         return {
             "schema": SCHEMA,
             "running": True,
@@ -246,7 +232,7 @@ class Monitor:
             else {"age_s": now_s - self._sample_s if self._sample_s > -math.inf else None}
             | plain({name: value for name, value in sample._asdict().items() if name != "time_s"}),
             **self._report,
-            "notices": [*self._find_notices().values(), *self._troubles()],
+            "notices": [*self._find_notices().values(), *troubles],
             "samples": samples,
             "samples_per_s": self._rate,
             "frames": {
@@ -260,7 +246,7 @@ class Monitor:
             "bus_up": not any(getattr(port, name, False) for name in ("is_away", "is_off")),
             "bus_counts": {name: n for name, n in counts.items() if n is not None},
             "bus_trouble": getattr(port, "trouble", "") or None,
-            "polls": None if self.polls is None else asdict(self.polls),
+            "polls": None if self.polls is None else dict(self.polls),
             "config": self._config,
             "latency": self._latency.to_dict(),
             "step": self._step.to_dict(),
