@@ -205,10 +205,8 @@ def _show(row: Row) -> None:
     )
 
 
-BY_CASE = (
-    "case",
-    "MAE [%]",
-    "median [%]",
+ERROR = ("MAE [%]", "median [%]")
+CERTAINTY = (
     "by voltage alone [%]",
     "by counting [%]",
     "within 2σ",
@@ -218,38 +216,51 @@ BY_CASE = (
     "right and not VALID",
     "astray",
 )
+"""Columns of an estimator that states a standard deviation and a validity."""
+
+
+def _states_certainty(rows: Sequence[Row]) -> bool:
+    return any(row.cover for row in rows)
 
 
 def by_case(rows: Sequence[Row], title: str = "") -> Table:
     """Return the means of each case over packs and numbers of logs."""
-    table = Table(*BY_CASE, title=title)
+    has_certainty = _states_certainty(rows)
+    table = Table("case", *ERROR, *(CERTAINTY if has_certainty else ()), title=title)
     for case, group in grouped(rows, "case"):
-        enough = sum(row.cover >= COVER for row in group)
-        table.add_row(
-            case,
-            f"{_mean(group, 'mae'):.2f}",
-            f"{_mean(group, 'median'):.2f}",
-            f"{_mean(group, 'newton'):.2f}",
-            f"{_mean(group, 'counting'):.2f}",
-            f"{_mean(group, 'cover'):.0%}",
-            f"{enough} of {len(group)}",
-            f"{_mean(group, 'valid'):.0%}",
-            f"{_mean(group, 'valid_wrong'):.1%}",
-            f"{_mean(group, 'right_not_valid'):.0%}",
-            f"{sum(row.astray for row in group)} of {sum(row.logs for row in group)}",
-        )
+        error = f"{_mean(group, 'mae'):.2f}", f"{_mean(group, 'median'):.2f}"
+        table.add_row(case, *error, *(_certainty(group) if has_certainty else ()))
     return table
+
+
+def _certainty(group: Sequence[Row]) -> tuple[str, ...]:
+    """Return the cells of `CERTAINTY`."""
+    enough = sum(row.cover >= COVER for row in group)
+    return (
+        f"{_mean(group, 'newton'):.2f}",
+        f"{_mean(group, 'counting'):.2f}",
+        f"{_mean(group, 'cover'):.0%}",
+        f"{enough} of {len(group)}",
+        f"{_mean(group, 'valid'):.0%}",
+        f"{_mean(group, 'valid_wrong'):.1%}",
+        f"{_mean(group, 'right_not_valid'):.0%}",
+        f"{sum(row.astray for row in group)} of {sum(row.logs for row in group)}",
+    )
 
 
 def by_pack(rows: Sequence[Row]) -> Table:
     """Return the MAE [%] of each pack and number of logs in each case."""
     cases = list(dict.fromkeys(row.case for row in rows))
-    table = Table("pack", "logs", *cases, "most wrong and VALID")
+    has_certainty = _states_certainty(rows)
+    table = Table("pack", "logs", *cases, *(["most wrong and VALID"] if has_certainty else ()))
     for (pack, size), group in grouped(rows, "pack", "size"):
         mae = {row.case: f"{row.mae:.2f}" for row in group}
-        worst = max(group, key=lambda row: row.valid_wrong)
-        wrong = f"{worst.valid_wrong:.1%} ({worst.case})" if worst.valid_wrong else "none"
-        table.add_row(pack, str(size), *(mae.get(case, "") for case in cases), wrong)
+        cells = [pack, str(size), *(mae.get(case, "") for case in cases)]
+        if has_certainty:
+            worst = max(group, key=lambda row: row.valid_wrong)
+            wrong = f"{worst.valid_wrong:.1%} ({worst.case})" if worst.valid_wrong else "none"
+            cells.append(wrong)
+        table.add_row(*cells)
     return table
 
 
