@@ -11,10 +11,9 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
-from cangauge.extras.live.serve import Offer, to_json
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot, StatusSocket
-from live import waits
+from live import loop_config, waits
 
 
 class Shown(Output):
@@ -32,13 +31,13 @@ class Served:
 
     Parameters
     ----------
-    offer : Offer
-        Port 0 for addresses: `port` is the first one's.
     snapshot : Snapshot
         The first one.
+    **keys
+        Of the configuration. Port 0 for addresses: `port` is the first one's.
     """
 
-    def __init__(self, offer: Offer, snapshot: Snapshot) -> None:
+    def __init__(self, snapshot: Snapshot, **keys: Any) -> None:
         self.show(snapshot)
         self._folder = tempfile.TemporaryDirectory()
         endpoint = Path(self._folder.name, "s.sock")
@@ -49,11 +48,12 @@ class Served:
         )  # fmt: skip
         assert self.process.stdin is not None
         with self.process.stdin as stdin:
-            stdin.write(to_json(endpoint, offer, "json", "info"))
+            config = loop_config(status_socket=str(endpoint), log_format="json", **keys)
+            stdin.write(config.model_dump_json())
         self.lines: list[dict[str, Any]] = []
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
-        if offer.http or offer.dashboard:
+        if {"http", "dashboard"} & keys.keys():
             assert waits(lambda: any("port" in line for line in self.lines)), self.lines
             self.port = next(line["port"] for line in self.lines if "port" in line)
 

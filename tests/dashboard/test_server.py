@@ -20,17 +20,17 @@ from tornado.websocket import websocket_connect
 from cangauge.bus.open import UNKNOWN_INTERFACE
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import Live
-from cangauge.extras.live.serve import Offer, to_json
 from cangauge.service.pipeline import Pipeline
+from cangauge.service.run import Service
 from cangauge.service.status import Monitor
 from cangauge.service.status_client import Snapshot, StatusSocket
-from live import LoggedLines, in_process, leaf_model, leaf_model_path, waits
+from live import LoggedLines, in_process, leaf_model, leaf_model_path, loop_config, waits
 from running import free_port
 from served import Served
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
 def snapshot() -> Snapshot:
@@ -50,9 +50,9 @@ def get(page: Served, path: str, **options: Any) -> tuple[int, dict[str, str], b
         connection.close()
 
 
-def live_page(token_file: Path | None = None) -> Served:
+def live_page(token_file: str | None = None) -> Served:
     """Serve a page of one snapshot."""
-    return Served(Offer(dashboard=http_address("127.0.0.1:0", token_file, {})), snapshot())
+    return Served(snapshot(), dashboard="127.0.0.1:0", http_token_file=token_file)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)
-    with live_page(file) as page:
+    with live_page(str(file)) as page:
         yield page
 
 
@@ -180,7 +180,7 @@ def test_a_token_is_needed_for_which_the_browser_is_asked(guarded: Served) -> No
     for path in ("/rows", "/cangauge-last-hour.csv"):
         assert get(guarded, path)[0] == 401
         assert get(guarded, path, headers={"Cookie": "cangauge=guess"})[0] == 401
-        assert get(guarded, path, headers={"Authorization": f"Bearer {TOKEN}"})[0] == 200
+        assert get(guarded, path, headers=BEARER)[0] == 200
     code, headers, _ = get(guarded, "/")
     assert (code, headers["Location"]) == (302, "/enter")
     assert entered(guarded, "wrong") == (401, "")
@@ -212,10 +212,10 @@ def test_a_service_that_hangs_is_shown_as_gone(page: Served) -> None:
 @pytest.fixture
 def child(tmp_path: Path) -> Iterator[Live]:
     """The child of a service, with the page on a port that is free."""
-    offer = Offer(dashboard=http_address(str(free_port()), None, {}))
+    config = loop_config(dashboard=str(free_port()))
     with (
         closing(StatusSocket(tmp_path / "s.sock", lambda: snapshot().status)),
-        closing(Live(to_json(tmp_path / "s.sock", offer, "json", "info"))) as child,
+        closing(Live(tmp_path / "s.sock", config)) as child,
     ):
         child.on_snapshot(snapshot())
         assert child.trouble == ""
@@ -224,8 +224,8 @@ def child(tmp_path: Path) -> Iterator[Live]:
 
 def test_a_child_that_dies_is_reported_once_with_the_cure(child: Live) -> None:
     with LoggedLines("cangauge.extras.live") as lines:
-        child._process.kill()
-        child._process.wait()
+        child.process.kill()
+        child.process.wait()
         child.on_snapshot(snapshot())
         child.on_snapshot(snapshot())
     assert "exit code -9" in child.trouble
@@ -234,28 +234,32 @@ def test_a_child_that_dies_is_reported_once_with_the_cure(child: Live) -> None:
 
 
 def test_the_child_ends_with_the_service_though_it_hangs(child: Live) -> None:
-    child._process.send_signal(signal.SIGSTOP)
+    child.process.send_signal(signal.SIGSTOP)
     child.close()
-    assert child._process.poll() is not None
+    assert child.process.poll() is not None
 
 
-def test_an_address_that_is_taken_is_refused_at_the_start(page: Served) -> None:
+def test_an_address_that_is_taken_is_refused_at_the_start(page: Served, tmp_path: Path) -> None:
+    service = Service(
+        model=str(leaf_model_path()),
+        interface="virtual",
+        channel="taken",
+        status_socket=str(tmp_path / "s.sock"),
+        dashboard=f"127.0.0.1:{page.port}",
+    )
     with pytest.raises(InputError, match="cannot listen") as caught:
-        Offer(dashboard=http_address(f"127.0.0.1:{page.port}", None, {}, "dashboard")).check_free()
+        service.run()
     assert caught.value.field == "dashboard"
 
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Serve health checks, on `port`, and the live page with a token."""
+    """Serve health checks, on `port`, and the live page, with a token."""
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)
-    addresses = {
-        "http": http_address("127.0.0.1:0", None, {}),
-        "dashboard": http_address("127.0.0.1:0", file, {}),
-    }
-    with Served(Offer(**addresses), snapshot()) as served:
+    address = "127.0.0.1:0"
+    with Served(snapshot(), http=address, dashboard=address, http_token_file=str(file)) as served:
         assert waits(lambda: served.said("live page: "))
         yield served
 
@@ -271,7 +275,7 @@ def page_port(served: Served) -> int:
 
 
 def test_a_health_check_comes_before_many_viewers(both: Served) -> None:
-    assert waits(lambda: b"ok" in get(both, "/healthz")[2])
+    assert waits(lambda: b"ok" in get(both, "/healthz", headers=BEARER)[2])
     ask = (
         f"GET /cangauge-last-hour.csv HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {TOKEN}\r\n\r\n"
     )
@@ -279,7 +283,7 @@ def test_a_health_check_comes_before_many_viewers(both: Served) -> None:
     for _ in range(5):  # a busy machine may hold this process back
         both.process.send_signal(signal.SIGSTOP)  # so that all ask at once
         viewers = [connected(page_port(both), ask.encode()) for _ in range(120)]
-        probe = connected(both.port, b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        probe = connected(both.port, ask.replace("cangauge-last-hour.csv", "healthz").encode())
         both.process.send_signal(signal.SIGCONT)
         assert probe.recv(9) == b"HTTP/1.1 "
         answered.append(len(select.select(viewers, [], [], 0.0)[0]))
@@ -294,7 +298,7 @@ def test_connections_are_limited(both: Served) -> None:
     clients = [connected(page_port(both), b"GET / HTTP/1.1\r\nX: ") for _ in range(230)]
     pid = both.process.pid
     assert waits(lambda: len(list(Path(f"/proc/{pid}/fd").iterdir())) > 150)
-    assert b"ok" in get(both, "/healthz")[2]
+    assert b"ok" in get(both, "/healthz", headers=BEARER)[2]
     open_ones = len(list(Path(f"/proc/{pid}/fd").iterdir()))
     assert open_ones < 225
     for client in clients:

@@ -18,11 +18,9 @@ from cangauge.bus.open import BusAddress
 from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError
 from cangauge.extras.inverter.gateway import Gateway
-from cangauge.extras.live.addresses import http_address
-from cangauge.extras.live.serve import Offer, to_json
 from cangauge.service.record import Recorder
 from cangauge.service.status_client import SCHEMA, StatusSocket
-from live import waits
+from live import loop_config, waits
 from running import RunningService
 
 REFUSED = "can't start new thread"
@@ -79,11 +77,11 @@ def test_what_serves_networks_without_threads_ends_and_says_so(tmp_path: Path) -
         f"def refuse(*_): raise RuntimeError({REFUSED!r})\n"
         "threading._start_new_thread = refuse\nmain()"
     )
-    with closing(StatusSocket(tmp_path / "s.sock", lambda: {"schema": SCHEMA})):
-        offer = Offer(http=http_address("127.0.0.1:0", None, {}))
+    with closing(StatusSocket(tmp_path / "s.sock", lambda: {"schema": SCHEMA, "bus": "x"})):
+        config = loop_config(http="127.0.0.1:0", status_socket=str(tmp_path / "s.sock"))
         found = subprocess.run(
             [sys.executable, "-c", script],
-            input=to_json(tmp_path / "s.sock", offer, "text", "info"),
+            input=config.model_dump_json(),
             capture_output=True,
             text=True,
             timeout=60.0,

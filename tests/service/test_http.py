@@ -21,7 +21,6 @@ from watched import Watched
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import http_address, read_token
 from cangauge.extras.live.http import MAX_CLIENTS
-from cangauge.extras.live.serve import Offer
 from cangauge.model.published import CAPACITY_AH
 from cangauge.service.status_client import Snapshot
 from live import waits
@@ -41,9 +40,7 @@ def watched() -> Watched:
 
 @pytest.fixture(scope="module")
 def http(watched: Watched) -> Iterator[Served]:
-    with Served(
-        Offer(http=http_address("127.0.0.1:0", None, {})), watched.monitor.latest
-    ) as server:
+    with Served(watched.monitor.latest, http="127.0.0.1:0") as server:
         yield server
 
 
@@ -112,19 +109,19 @@ def test_without_prometheus_client(
 ) -> None:
     (tmp_path / "prometheus_client.py").write_text("raise ImportError\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with Served(
-        Offer(http=http_address("127.0.0.1:0", None, {})), watched.monitor.latest
-    ) as server:
+    with Served(watched.monitor.latest, http="127.0.0.1:0") as server:
         assert waits(lambda: get(server.port, "/status")[0] == 200)
         code, body, _ = get(server.port, "/metrics")
     assert code == 404
     assert b"cangauge[metrics]" in body
 
 
-def test_a_token_is_required_where_there_is_one(watched: Watched) -> None:
-    address = http_address("127.0.0.1:0", None, {"CANGAUGE_HTTP_TOKEN": TOKEN})
-    assert TOKEN not in repr(address)
-    with Served(Offer(http=address), watched.monitor.latest) as server:
+def test_a_token_is_required_where_there_is_one(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CANGAUGE_HTTP_TOKEN", TOKEN)
+    assert TOKEN not in repr(http_address("127.0.0.1:0"))
+    with Served(watched.monitor.latest, http="127.0.0.1:0") as server:
         assert waits(lambda: get(server.port, "/status", Authorization=f"Bearer {TOKEN}")[0] == 200)
         for path in ("/status", "/healthz", "/metrics", "/nothing"):
             code, body, headers = get(server.port, path)

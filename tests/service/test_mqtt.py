@@ -16,9 +16,8 @@ import pytest
 from watched import Watched
 
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import MqttOptions, mqtt_options
-from cangauge.extras.live.serve import Offer
-from cangauge.service.config import load_config
+from cangauge.service.config import MqttConfig
+from cangauge.service.run import Service
 from live import Command, leaf_model_path, waits
 from running import RunningService, free_port
 from served import Served
@@ -181,19 +180,18 @@ def test_a_killed_service_is_offline(tmp_path: Path, broker: Broker, listener: L
     assert waits(lambda: listener.availability == "offline")
 
 
-def test_the_last_will_of_a_killed_publisher(
-    tmp_path: Path, broker: Broker, listener: Listener
-) -> None:
-    path = tmp_path / "mqtt.toml"
-    path.write_text(f'model = "{leaf_model_path()}"\n{section(broker.port)}')
-    status = Watched().monitor.latest
-    with Served(Offer(mqtt=options_in(path)), status) as served:
+def test_the_last_will_of_a_killed_publisher(broker: Broker, listener: Listener) -> None:
+    config = MqttConfig(broker="127.0.0.1", port=broker.port, device="bench", every_s=0.2)
+    with Served(Watched().monitor.latest, mqtt=config) as served:
         assert waits(lambda: listener.availability == "online")
         served.process.kill()
         assert waits(lambda: listener.availability == "offline")
 
 
-def test_password_and_tls_are_used(tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", ["file", "environment"])
+def test_password_and_tls_are_used(
+    tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     certificate = tmp_path / "ca.pem"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj",
@@ -215,19 +213,17 @@ def test_password_and_tls_are_used(tmp_path: Path) -> None:
     )
     listener = Listener(broker, "car", certificate)
     text = section(broker.port, 'tls = true\nca_file = "ca.pem"\nuser = "car"\n')
-    text = text.replace("127.0.0.1", "localhost") + 'password_file = "password"\n'
+    text = text.replace("127.0.0.1", "localhost")
+    if place == "file":
+        text += 'password_file = "password"\n'
+    else:
+        monkeypatch.setenv("CANGAUGE_MQTT_PASSWORD", PASSWORD)
     try:
         with RunningService(tmp_path, text):
             assert waits(lambda: "soc_pct" in listener.state())
     finally:
         listener.close()
         broker.end()
-
-
-def options_in(path: Path) -> MqttOptions:
-    config = load_config(path).mqtt
-    assert config is not None
-    return mqtt_options(config, "can0")
 
 
 @pytest.mark.parametrize(
@@ -248,19 +244,19 @@ def test_a_wrong_section_is_refused_by_key(tmp_path: Path, lines: str, field: st
     path = tmp_path / "run.toml"
     path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\n{lines}')
     with pytest.raises(InputError) as caught:
-        options_in(path)
+        Service(path)
     assert caught.value.field == field
 
 
-def test_defaults_and_a_password_that_is_in_no_repr(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_port_and_the_device_have_defaults(
+    tmp_path: Path, broker: Broker, listener: Listener
 ) -> None:
-    monkeypatch.setenv("CANGAUGE_MQTT_PASSWORD", PASSWORD)
-    path = tmp_path / "run.toml"
-    for lines, port in (("", 1883), ("tls = true\n", 8883), ("port = 7\n", 7)):
-        path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n{lines}')
-        options = options_in(path)
-        assert options.port == port
-        assert options.password == PASSWORD
-        assert re.fullmatch(r"cangauge_[A-Za-z0-9_-]+_can0", options.device)
-        assert PASSWORD not in f"{load_config(path)!r} {options!r}"
+    status = Watched().monitor.latest
+    for keys, port in (({}, 1883), ({"tls": True}, 8883)):
+        nowhere = MqttConfig(broker="no.such.host.invalid", **keys)
+        with Served(status, mqtt=nowhere) as served:
+            assert waits(lambda: served.said(f"no.such.host.invalid:{port}: not reachable"))  # noqa: B023
+    with Served(status, mqtt=MqttConfig(broker="127.0.0.1", port=broker.port)):
+        assert waits(lambda: any(topic.endswith("/state") for topic in listener.latest))
+    states = [topic for topic in listener.latest if topic.endswith("/state")]
+    assert re.fullmatch(r"cangauge/cangauge_[A-Za-z0-9_-]+_virtual_x/state", states[0])

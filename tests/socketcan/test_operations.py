@@ -15,8 +15,6 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.extras.live.addresses import http_address
-from cangauge.extras.live.serve import Offer
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
@@ -50,7 +48,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
         Recorder(tmp_path / "seen.log", part_bytes=5_000) as recorder,
     ):
         monitor = Monitor(pipeline, port, recorder=recorder)
-        server = Served(Offer(http=http_address("127.0.0.1:0", None, {})), monitor.latest)
+        server = Served(monitor.latest, http="127.0.0.1:0")
         outputs = [Rows(rows), recorder, Shown(server)]
         loop = Loop(port, pipeline, outputs=outputs, monitor=monitor)
         thread = threading.Thread(target=loop.run, args=(stop.is_set,))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
-import re
 import socket
 import ssl
 import stat
@@ -18,13 +17,12 @@ from dataclasses import dataclass, field
 from os import PathLike
 from typing import TYPE_CHECKING, Final
 
-from cangauge._extras import require_extra
 from cangauge._files import open_regular
 from cangauge._logging import emit
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.service.config import MqttConfig
+    from cangauge.service.config import MqttConfig, RunConfig
 
 _LOG = logging.getLogger(__name__)
 
@@ -160,43 +158,52 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
     return token
 
 
-@dataclass(frozen=True, slots=True)
-class MqttOptions:
-    """Keys of `[mqtt]` with their defaults, and the password in place of its file."""
-
-    broker: str
-    port: int
-    tls: bool
-    ca_file: str | None
-    user: str | None
-    password: str | None = field(repr=False)
-    topic_prefix: str
-    discovery_prefix: str
-    device: str
-    every_s: float
+def http_addresses(config: RunConfig) -> dict[str, HttpAddress]:
+    """Return the addresses that a configuration has, by key; may raise InputError."""
+    given = {"http": config.http, "dashboard": config.dashboard}
+    return {
+        key: http_address(text, config.http_token_file, field=key)
+        for key, text in given.items()
+        if text is not None
+    }
 
 
-def mqtt_options(config: MqttConfig, bus: str) -> MqttOptions:
-    """Return the options of `[mqtt]` for a bus of this name.
+def mqtt_password(config: MqttConfig) -> str | None:
+    """Return the password in its file, or in the environment; None if there is neither.
 
     Raises
     ------
     InputError
-        If paho-mqtt is not installed, or certificates or password cannot be used.
+        If it cannot be read, is no line of text, or belongs to no user.
     """
-    require_extra("mqtt", "mqtt")
-    name = re.sub(r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}")
-    given = config.model_dump(exclude={"password_file"}) | {
-        "port": config.port or (8883 if config.tls else 1883),
-        "device": config.device or name,
-    }
-    options = MqttOptions(**given, password=_mqtt_password(config.password_file))
-    if options.password is not None and config.user is None:
+    password = os.environ.get(MQTT_PASSWORD_VARIABLE)
+    if (path := config.password_file) is not None:
+        text = _read_secret(path, "mqtt.password_exposed", "password", "mqtt.password_file")
+        password = text.rstrip("\r\n")
+        if not 0 < len(password) <= LONGEST_TOKEN or not password.isprintable():
+            raise InputError(
+                f"a password is one line of 1 to {LONGEST_TOKEN} printable characters",
+                source=path,
+                field="mqtt.password_file",
+            )
+    if password is not None and config.user is None:
         cure = "name the user whose password is given"
         raise InputError("is missing", field="mqtt.user", cure=cure)
+    return password
+
+
+def mqtt_tls(config: MqttConfig) -> ssl.SSLContext | None:
+    """Return the certificates to check the broker by; None where it is not encrypted.
+
+    Raises
+    ------
+    InputError
+        If they cannot be read.
+    """
+    if not config.tls:
+        return None
     try:
-        if config.tls:
-            ssl.create_default_context(cafile=config.ca_file)
+        return ssl.create_default_context(cafile=config.ca_file)
     except OSError as error:
         raise InputError(
             f"no certificates can be read: {error}",
@@ -204,22 +211,6 @@ def mqtt_options(config: MqttConfig, bus: str) -> MqttOptions:
             value=config.ca_file,
             cure="name a PEM file",
         ) from error
-    return options
-
-
-def _mqtt_password(path: str | None) -> str | None:
-    """Return the password in a file, or in the environment; None if there is neither."""
-    if path is None:
-        return os.environ.get(MQTT_PASSWORD_VARIABLE)
-    text = _read_secret(path, "mqtt.password_exposed", "password", "mqtt.password_file")
-    password = text.rstrip("\r\n")
-    if not 0 < len(password) <= LONGEST_TOKEN or not password.isprintable():
-        raise InputError(
-            f"a password is one line of 1 to {LONGEST_TOKEN} printable characters",
-            source=path,
-            field="mqtt.password_file",
-        )
-    return password
 
 
 def _read_secret(path: str | PathLike[str], event: str, kind: str, key: str) -> str:

@@ -26,57 +26,65 @@ _CLOCK: Final = "%H:%M:%S"
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line of a figure: column, name in the legend ("" without), colour and dash."""
-
-    column: str
-    name: str = ""
-    color: str = BLUE
-    dash: str = "solid"
-
-
-@dataclass(frozen=True)
 class Chart:
-    """A figure over time: title with unit, its lines, and the text at the pointer."""
+    """A figure over time.
+
+    Parameters
+    ----------
+    title : str
+        With the unit.
+    lines : dict
+        What bokeh draws, by column.
+    hover : str
+        Text at the pointer.
+    height : int
+        [px]
+    """
 
     title: str
-    lines: tuple[Line, ...]
+    lines: dict[str, dict[str, str]]
     hover: str
     height: int = 200
+
+
+def _dashed(name: str, colour: str) -> dict[str, str]:
+    return {"legend_label": name, "line_color": colour, "line_dash": "dashed"}
 
 
 CHARTS: Final = {
     "soc": Chart(
         "State of charge [%] with its band of ±2σ",
-        (
-            Line("soc_newton_pct", "by voltage (Newton)", ORANGE),
-            Line("soc_pct", "estimate"),
-            Line("soc_coulomb_pct", "by counting", GREEN, "dashed"),
-        ),
+        {
+            "soc_newton_pct": {"legend_label": "by voltage (Newton)", "line_color": ORANGE},
+            "soc_pct": {"legend_label": "estimate"},
+            "soc_coulomb_pct": _dashed("by counting", GREEN),
+        },
         "@soc_pct{0.00} % (@soc_low_pct{0.0} to @soc_high_pct{0.0} %),"
         " voltage @soc_newton_pct{0.0} %, counting @soc_coulomb_pct{0.0} %",
         280,
     ),
-    "current": Chart(
-        "Current [A], positive discharges", (Line("current_a"),), "@current_a{0.00} A"
-    ),
+    "current": Chart("Current [A], positive discharges", {"current_a": {}}, "@current_a{0.00} A"),
     "voltage": Chart(
         "Voltage [V]",
-        (Line("voltage_v", "measured"), Line("voltage_model_v", "model", ORANGE, "dashed")),
+        {
+            "voltage_v": {"legend_label": "measured"},
+            "voltage_model_v": _dashed("model", ORANGE),
+        },
         "measured @voltage_v{0.00} V, model @voltage_model_v{0.00} V",
     ),
-    "residual": Chart(
-        "Residual, measured − model [mV]", (Line("residual_mv"),), "@residual_mv{0} mV"
-    ),
-    "temperature": Chart("Temperature [°C]", (Line("temperature_c"),), "@temperature_c{0.0} °C"),
+    "residual": Chart("Residual, measured − model [mV]", {"residual_mv": {}}, "@residual_mv{0} mV"),
+    "temperature": Chart("Temperature [°C]", {"temperature_c": {}}, "@temperature_c{0.0} °C"),
     "rates": Chart(
         "Frames and rejects [1/s]",
-        (Line("frames_per_s", "frames"), Line("rejects_per_s", "rejects", ORANGE, "dashed")),
+        {
+            "frames_per_s": {"legend_label": "frames"},
+            "rejects_per_s": _dashed("rejects", ORANGE),
+        },
         "@frames_per_s{0} frames/s, @rejects_per_s{0.0} rejects/s",
     ),
     "latency": Chart(
         "Latency from frame to SoC, mean of a second [ms]",
-        (Line("latency_ms"),),
+        {"latency_ms": {}},
         "@latency_ms{0.00} ms",
     ),
 }
@@ -137,16 +145,9 @@ def _plot(name: str, height: int, shared: Range1d, **options: Any) -> Any:
 
 def _figure(name: str, chart: Chart, rows: ColumnDataSource, shared: Range1d) -> Any:
     plot = _plot(name, chart.height, shared)
-    for line in chart.lines:
-        label = {"legend_label": line.name} if line.name else {}
+    for column, style in chart.lines.items():
         drawn = plot.line(
-            "time_ms",
-            line.column,
-            source=rows,
-            line_color=line.color,
-            line_dash=line.dash,
-            line_width=1.8,
-            **label,
+            "time_ms", column, source=rows, line_width=1.8, **{"line_color": BLUE} | style
         )
     plot.add_tools(
         HoverTool(
@@ -156,7 +157,7 @@ def _figure(name: str, chart: Chart, rows: ColumnDataSource, shared: Range1d) ->
             formatters={"@time_ms": "datetime"},
         )
     )
-    if any(line.name for line in chart.lines):
+    if len(chart.lines) > 1:
         legend = plot.legend[0]
         plot.add_layout(legend, "above")
         legend.orientation, legend.click_policy = "horizontal", "hide"

@@ -31,7 +31,7 @@ def live_command(
     `cangauge live /etc/cangauge/can0.toml --endpoint /run/cangauge/can0/status.sock`
     """
     from cangauge.errors import InputError
-    from cangauge.extras.live.launch import offer_of
+    from cangauge.extras.live.launch import check
     from cangauge.extras.live.serve import serve
     from cangauge.service.config import load_config
     from cangauge.service.events import logging_to
@@ -42,7 +42,7 @@ def live_command(
         cure = 'add dashboard = "8642", http = "9464" or [mqtt]'
         raise InputError("serves nothing", source=config, cure=cure)
     with logging_to(loaded.log_format, loaded.log_level), loaded.naming_keys():
-        offer = offer_of(loaded)
+        check(loaded)
         is_auto = loaded.status_socket == "auto"
         own = find_socket() if is_auto else Path(loaded.status_socket)
-        serve(endpoint or own, offer)
+        serve(endpoint or own, loaded)

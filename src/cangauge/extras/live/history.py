@@ -11,14 +11,12 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._typing import FloatArray
+from cangauge.service.status_client import SHOW_EVERY_S
 from cangauge.types import REASON_WORDS, Reason, Status, reason_name
 
-ROW_EVERY_S: Final = 0.1
-"""Interval of the rows [s]: that of SOC_ESTIMATE."""
-LOST_AFTER_S: Final = 0.7
-"""Time without a status after which the service counts as gone [s]: seen within a second."""
 SILENT_AFTER_S: Final = 0.7
-"""Age of the latest sample at which a bus counts as silent [s]; for the same reason."""
+"""Time without a status after which the service counts as gone, and without a sample the bus as
+silent [s]: seen within a second."""
 SILENT_INTERVALS: Final = 3.0
 """The same on a bus whose samples come seldom, in intervals of the samples."""
 RATE_OVER_S: Final = 1.0
@@ -86,7 +84,7 @@ class Span:
         """Add a row, unless it comes too early for this rate."""
         if self._kept:
             waited_s = 1e-3 * (row[0] - self._rows[(self.added - 1) % self.rows_at_most, 0])
-            if 0.0 <= waited_s < self.every_s - 0.5 * ROW_EVERY_S:
+            if 0.0 <= waited_s < self.every_s - 0.5 * SHOW_EVERY_S:
                 return
         if self._thins and self._kept == self.rows_at_most:
             half = self.rows()[::2].copy()
@@ -125,14 +123,14 @@ class History:
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
         self._clock = clock
         self._received_s = -math.inf
-        self._interval_s = ROW_EVERY_S
+        self._interval_s = SHOW_EVERY_S
         self._samples = 0
         self._sample_s = 0.0
         self._counts: deque[tuple[float, ...]] = deque(maxlen=64)
         self.status: dict[str, Any] | None = None
-        self.hour = Span(ROW_EVERY_S, 36_000)
+        self.hour = Span(SHOW_EVERY_S, 36_000)
         self.spans = {
-            "10min": Span(ROW_EVERY_S, 6000),
+            "10min": Span(SHOW_EVERY_S, 6000),
             "1h": Span(1.0, 3600),
             "all": Span(1.0, 4000, thins=True),
         }
@@ -161,7 +159,7 @@ class History:
         status, silent_s = self.status, self._clock() - self._received_s
         if status is None:
             return ["Waiting for the service."]
-        if silent_s > LOST_AFTER_S:
+        if silent_s > SILENT_AFTER_S:
             return [f"The service has not reported for {silent_s:.1f} s. The values are old."]
         found = []
         if status["loop_stuck"]:

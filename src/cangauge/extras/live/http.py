@@ -12,7 +12,6 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -43,11 +42,18 @@ REQUEST_WITHIN_S: Final = 3.0
 """Time limit for receiving a request [s]."""
 PING_S: Final = 10.0
 """Interval at which a viewer of the live page must show that it still listens [s]."""
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:;"
+    " style-src 'self' 'unsafe-inline'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
 _LOG = logging.getLogger(__name__)
 
+Routes = dict[str, tuple[type["Handler"], bool]]
+"""Patterns of paths, the first that matches counts: who answers, and whether a token is needed."""
 
-class StatusServer(Output):
-    """Serve snapshots on the running loop.
+
+class Site(Output):
+    """Pages of one address, served on the running loop, and who may read them.
 
     Parameters
     ----------
@@ -55,60 +61,89 @@ class StatusServer(Output):
         Its token is needed by requests.
     listening : socket
         Bound to it.
+    routes : dict
+        Pages by patterns of their paths.
+    elsewhere : str
+        Answer of all other paths.
+    **limits
+        Of tornado's `HTTPServer`.
 
     Attributes
     ----------
-    latest : Snapshot or None
-        None before the first.
+    cookie : str or None
+        Cookie that is as good as the token.
     """
 
-    def __init__(self, address: HttpAddress, listening: socket.socket) -> None:
-        self.token = address.token
-        self.brake = Brake()
-        self.latest: Snapshot | None = None
-        pages: dict[str, type[Handler]] = {
-            "/status": _StatusPage,
-            "/healthz": _Health,
-            "/metrics": _Metrics,
-            ".*": Nothing,
-        }
-        limits = {
-            "no_keep_alive": True,
-            "max_buffer_size": MAX_HEADER_BYTES + MAX_BODY_BYTES,
-            "idle_connection_timeout": REQUEST_WITHIN_S,
-            "body_timeout": REQUEST_WITHIN_S,
-        }
-        serve(self, listening, pages, limits)
+    cookie: str | None = None
 
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Make a snapshot the latest one."""
-        self.latest = snapshot
+    def __init__(
+        self,
+        address: HttpAddress,
+        listening: socket.socket,
+        routes: Routes,
+        elsewhere: str,
+        **limits: Any,
+    ) -> None:
+        self.token = address.token
+        self.elsewhere = elsewhere
+        self._blocked_until_s: dict[str, float] = {}  # by peer: a second for each wrong token
+        application = Application(
+            [
+                (path, page, {"site": self, "needs_token": needs_token})
+                for path, (page, needs_token) in routes.items()
+            ],
+            log_function=_log_nothing,
+            websocket_ping_interval=PING_S,
+            websocket_max_message_size=MAX_BODY_BYTES,
+        )
+        listening.setblocking(False)
+        sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
+        _Server(application, **sizes, **limits).add_socket(listening)
+
+    def check_token(self, header: str, peer: str, wrong_at_most: int) -> bool:
+        """Return whether an Authorization header bears the token; takes the same time for each.
+
+        Raise the HTTP error 429 if the peer has given too many wrong ones lately.
+        """
+        now_s = time.monotonic()
+        if self._blocked_until_s.get(peer, 0.0) - now_s > wrong_at_most:
+            raise HTTPError(429, reason="Too many wrong tokens: wait a second")
+        if self.token is None:
+            return True
+        scheme, _, given = header.partition(" ")
+        same = hmac.compare_digest(given.strip().encode("utf-8", "replace"), self.token.encode())
+        if same and scheme.lower() == "bearer":
+            return True
+        until_s = max(self._blocked_until_s.pop(peer, now_s), now_s)
+        self._blocked_until_s[peer] = until_s + 1.0
+        if len(self._blocked_until_s) > PEERS_AT_MOST:
+            del self._blocked_until_s[next(iter(self._blocked_until_s))]
+        return False
 
 
 def _log_nothing(_handler: RequestHandler) -> None:
     """Log no request: a client could fill the disk."""
 
 
-def serve(
-    server: Output,
-    listening: socket.socket,
-    pages: Mapping[str, type[Handler]],
-    limits: Mapping[str, Any],
-) -> None:
-    """Serve pages by patterns of their paths, with limits of tornado's `HTTPServer`.
+class StatusServer(Site):
+    """Serve snapshots; `latest` is None before the first."""
 
-    The first pattern that matches counts.
-    """
-    context = {"server": server}
-    application = Application(
-        [(path, page, context) for path, page in pages.items()],
-        log_function=_log_nothing,
-        websocket_ping_interval=PING_S,
-        websocket_max_message_size=MAX_BODY_BYTES,
-    )
-    listening.setblocking(False)
-    sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
-    _Server(application, **sizes, **limits).add_socket(listening)
+    def __init__(self, address: HttpAddress, listening: socket.socket) -> None:
+        self.latest: Snapshot | None = None
+        super().__init__(
+            address,
+            listening,
+            {"/(status|healthz|metrics)": (StatusPage, True), ".*": (Nothing, True)},
+            "available: /status, /healthz, /metrics",
+            no_keep_alive=True,
+            max_buffer_size=MAX_HEADER_BYTES + MAX_BODY_BYTES,
+            idle_connection_timeout=REQUEST_WITHIN_S,
+            body_timeout=REQUEST_WITHIN_S,
+        )
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Make a snapshot the latest one."""
+        self.latest = snapshot
 
 
 class _Server(HTTPServer):
@@ -132,46 +167,20 @@ class _Server(HTTPServer):
         super().on_close(server_conn)
 
 
-class Brake:
-    """Let a peer try tokens slowly: each wrong one counts for a second."""
-
-    def __init__(self) -> None:
-        self._until_s: dict[str, float] = {}
-
-    def check(self, peer: str, wrong_at_most: int) -> None:
-        """Raise the HTTP error 429 if a peer has given too many wrong tokens lately."""
-        if self._until_s.get(peer, 0.0) - time.monotonic() > wrong_at_most:
-            raise HTTPError(429, reason="Too many wrong tokens: wait a second")
-
-    def note_wrong(self, peer: str) -> None:
-        """Count a wrong token."""
-        now_s = time.monotonic()
-        self._until_s[peer] = max(self._until_s.pop(peer, now_s), now_s) + 1.0
-        if len(self._until_s) > PEERS_AT_MOST:
-            del self._until_s[next(iter(self._until_s))]
-
-
-def has_token(header: str, token: str) -> bool:
-    """Return whether an Authorization header bears the token; takes the same time for each."""
-    scheme, _, given = header.partition(" ")
-    same = hmac.compare_digest(given.strip().encode("utf-8", "replace"), token.encode("utf-8"))
-    return same and scheme.lower() == "bearer"
-
-
 class Handler(RequestHandler):
     """Access control and plain-text errors of all pages."""
 
-    needs_token = True
-
-    def initialize(self, server: Any) -> None:
-        """Take the server, which has the token."""
-        self.server = server
+    def initialize(self, site: Any, *, needs_token: bool) -> None:
+        """Take the site, which has the token."""
+        self.site, self._needs_token = site, needs_token
 
     def set_default_headers(self) -> None:
-        """Let no answer be stored."""
+        """Let no answer be stored, nor load anything from elsewhere."""
         self.clear_header("Server")
         self.set_header("Cache-Control", "no-store")
         self.set_header("X-Content-Type-Options", "nosniff")
+        self.set_header("Referrer-Policy", "no-referrer")
+        self.set_header("Content-Security-Policy", _POLICY)
 
     def prepare(self) -> None:
         """Refuse a request that lacks the token, or is by a foreign name."""
@@ -180,30 +189,25 @@ class Handler(RequestHandler):
         except ValueError:  # tornado would fail on it
             self.refuse(400, "the origin is no address")
             return
-        token = self.server.token
         # Against DNS rebinding: a web page could otherwise read this under another name.
-        if token is None and not is_loopback_name(self.request.host_name):
+        if self.site.token is None and not is_loopback_name(self.request.host_name):
             self.refuse(403, "request this by a loopback address")
-        elif token is not None and self.needs_token and not self.is_known(token):
-            self.refuse_unknown()
+        elif self._needs_token and not self.has_token():
+            self.set_header("WWW-Authenticate", "Bearer")
+            self.refuse(401, "a bearer token is required")
+            text = f"refused {self.request.remote_ip}: missing or wrong token"
+            emit(_LOG, logging.WARNING, "http.refused", text, remote=self.request.remote_ip)
 
-    def is_known(self, token: str) -> bool:
-        """Return whether the request bears the token."""
-        header, peer = self.request.headers.get("Authorization", ""), str(self.request.remote_ip)
-        if not header:
-            return False
-        self.server.brake.check(peer, WRONG_HEADERS)
-        if has_token(header, token):
+    def has_token(self) -> bool:
+        """Return whether the request bears the token or the cookie, where they are needed."""
+        site, cookie = self.site, self.get_cookie("cangauge", "") or ""
+        if site.token is None:
             return True
-        self.server.brake.note_wrong(peer)
-        return False
-
-    def refuse_unknown(self) -> None:
-        """Answer a request without the token."""
-        self.set_header("WWW-Authenticate", "Bearer")
-        self.refuse(401, "a bearer token is required")
-        text = f"refused {self.request.remote_ip}: missing or wrong token"
-        emit(_LOG, logging.WARNING, "http.refused", text, remote=self.request.remote_ip)
+        if site.cookie is not None and hmac.compare_digest(cookie.encode(), site.cookie.encode()):
+            return True
+        header = self.request.headers.get("Authorization", "")
+        peer = str(self.request.remote_ip)
+        return bool(header) and site.check_token(header, peer, WRONG_HEADERS)
 
     def refuse(self, code: int, text: str) -> None:
         """Answer with an error in plain text."""
@@ -221,41 +225,31 @@ class Handler(RequestHandler):
         self.finish(json.dumps(plain(content), ensure_ascii=False) + "\n")
 
 
-class _Page(Handler):
-    def prepare(self) -> None:
-        super().prepare()
-        if self.server.latest is None and not self._finished:
+class StatusPage(Handler):
+    """The status, whether the receive loop runs, and metrics."""
+
+    def get(self, name: str) -> None:
+        """Answer a request for "status", "healthz" or "metrics"."""
+        if self.site.latest is None:
             self.refuse(503, "the service has just started")
+            return
+        status = self.site.latest.at(time.monotonic())
+        if name == "status":
+            self.send_json(status)
+        elif name == "healthz":  # the status has the validity of the SoC
+            self.set_status(503 if status["loop_stuck"] else 200)
+            self.send_json({"ok": not status["loop_stuck"], "status": status["status"]})
+        else:
+            self._send_metrics(status)
 
-    @property
-    def status(self) -> dict[str, Any]:
-        """The status now."""
-        return dict(self.server.latest.at(time.monotonic()))
-
-
-class _StatusPage(_Page):
-    def get(self) -> None:
-        self.send_json(self.status)
-
-
-class _Health(_Page):
-    def get(self) -> None:
-        """Return whether the receive loop runs; `/status` has the validity of the SoC."""
-        status = self.status
-        if status["loop_stuck"]:
-            self.set_status(503)
-        self.send_json({"ok": not status["loop_stuck"], "status": status["status"]})
-
-
-class _Metrics(_Page):
-    def get(self) -> None:
+    def _send_metrics(self, status: dict[str, Any]) -> None:
         try:
             # An extra: only this page needs it.
             from cangauge.extras.live.metrics import render  # noqa: PLC0415
         except InputError as error:
             self.refuse(404, str(error))
             return
-        body, content_type = render(self.status, self.request.headers.get("Accept", ""))
+        body, content_type = render(status, self.request.headers.get("Accept", ""))
         self.set_header("Content-Type", content_type)
         self.finish(body)
 
@@ -263,10 +257,8 @@ class _Metrics(_Page):
 class Nothing(Handler):
     """Answer of all other paths."""
 
-    text = "available: /status, /healthz, /metrics"
-
     def prepare(self) -> None:
         """Refuse any request."""
         super().prepare()
         if not self._finished:
-            self.refuse(404, self.text)
+            self.refuse(404, self.site.elsewhere)

@@ -8,15 +8,14 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from cangauge._extras import require_extra
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import http_address, mqtt_options
-from cangauge.extras.live.serve import Offer, to_json
+from cangauge.extras.live.addresses import http_addresses, mqtt_password, mqtt_tls
 from cangauge.service.output import Output
-from cangauge.service.setup import address_of
 
 if TYPE_CHECKING:
     from cangauge.bus.vehicle import Vehicle
@@ -34,12 +33,17 @@ class Live(Output):
 
     Parameters
     ----------
-    given : str
-        What the child reads on its stdin, by `serve.to_json`.
+    endpoint : Path
+        Status socket of the service.
+    config : RunConfig
+
+    Attributes
+    ----------
+    process : subprocess.Popen
     """
 
-    def __init__(self, given: str) -> None:
-        self._process = subprocess.Popen(
+    def __init__(self, endpoint: Path, config: RunConfig) -> None:
+        self.process = subprocess.Popen(
             # -P: modules do not come from the working folder
             [sys.executable, "-P", "-m", "cangauge.extras.live.serve"],
             stdin=subprocess.PIPE,
@@ -47,13 +51,14 @@ class Live(Output):
             start_new_session=True,  # Ctrl-C ends the service, which ends the child
             text=True,
         )
-        assert self._process.stdin is not None  # noqa: S101 - as it was made
-        with suppress(BrokenPipeError), self._process.stdin as stdin:
-            stdin.write(given)
+        assert self.process.stdin is not None  # noqa: S101 - as it was made
+        told = config.model_copy(update={"status_socket": str(endpoint)})
+        with suppress(BrokenPipeError), self.process.stdin as stdin:
+            stdin.write(told.model_dump_json())
 
     def on_snapshot(self, snapshot: Snapshot) -> None:  # noqa: ARG002 - it asks for itself
         """Report once if the child has ended."""
-        code = self._process.poll()
+        code = self.process.poll()
         if code is not None and not self.trouble:
             self.trouble = (
                 f"live page, status by HTTP and MQTT have ended (exit code {code}); the estimate"
@@ -64,28 +69,25 @@ class Live(Output):
 
     def close(self) -> None:
         """End the child."""
-        self._process.terminate()
+        self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(END_WITHIN_S)
-        self._process.kill()
-        self._process.wait()
+            self.process.wait(END_WITHIN_S)
+        self.process.kill()
+        self.process.wait()
 
 
-def offer_of(config: RunConfig) -> Offer:
-    """Read addresses and secrets of a configuration; may raise InputError."""
+def check(config: RunConfig) -> None:
+    """Raise InputError if what a configuration asks to serve cannot be served."""
     if config.status_socket == "off":
         problem = "live page, status by HTTP and MQTT read the status socket"
         raise InputError(problem, field="status_socket", value="off", cure="remove it")
-    for key, needed in (("http", "metrics"), ("dashboard", "live")):
+    for key, needed in (("http", "metrics"), ("dashboard", "live"), ("mqtt", "mqtt")):
         if getattr(config, key) is not None:
             require_extra(needed, key)
-    addresses = {
-        key: http_address(str(getattr(config, key)), config.http_token_file, field=key)
-        for key in ("http", "dashboard")
-        if getattr(config, key) is not None
-    }
-    mqtt = None if config.mqtt is None else mqtt_options(config.mqtt, str(address_of(config)))
-    return Offer(**addresses, mqtt=mqtt)
+    http_addresses(config)
+    if config.mqtt is not None:
+        mqtt_password(config.mqtt)
+        mqtt_tls(config.mqtt)
 
 
 def _started_by_its_unit(_service: Service) -> Output:
@@ -97,7 +99,7 @@ def output_of(config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Outpu
     if os.name != "posix":
         problem = "live page, status by HTTP and MQTT need Linux or macOS"
         raise InputError(problem, field="dashboard", cure="run without them")
-    offer = offer_of(config)
+    check(config)
     if config.live == "unit":
         return _started_by_its_unit
 
@@ -105,7 +107,8 @@ def output_of(config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Outpu
         if service.endpoint is None:
             problem = "live page, status by HTTP and MQTT need it, and it cannot be opened"
             raise InputError(problem, field="status_socket", cure="name a path for it")
-        offer.check_free()
-        return Live(to_json(service.endpoint, offer, config.log_format, config.log_level))
+        for address in http_addresses(config).values():
+            address.listen().close()  # refused here if it is taken
+        return Live(service.endpoint, config)
 
     return start

@@ -1,29 +1,32 @@
 """Publish a running service's state to an MQTT broker, with Home Assistant's discovery.
 
-Needs paho-mqtt (extra `mqtt`). Two threads do the work: one publishes the latest snapshot, paho's
-own one has the network. A state that cannot be sent is dropped, since the next one replaces it.
+Needs paho-mqtt (extra `mqtt`), whose thread has the network. A state that cannot be sent is
+dropped, since the next one replaces it.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
-import ssl
-import threading
+import re
+import socket
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from paho.mqtt.client import Client, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion
 
 from cangauge._logging import emit
 from cangauge._version import __version__
-from cangauge.extras.live.addresses import MqttOptions, is_loopback_name
+from cangauge.extras.live.addresses import is_loopback_name, mqtt_password, mqtt_tls
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot, value_at
 from cangauge.types import Status
+
+if TYPE_CHECKING:
+    from cangauge.service.config import MqttConfig
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,105 +39,107 @@ LEAVE_WITHIN_S: Final = 0.5
 """Time limit for saying goodbye to the broker [s]."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Sensor:
-    """One sensor of Home Assistant, and the place of its state in a status."""
-
-    key: str
-    place: str
-    name: str
-    unit: str | None = None
-    device_class: str | None = None
-    digits: int | None = None
-    needs_soc: bool = False
-
-
-_SENSORS: Final = (
-    _Sensor("soc_pct", "estimate.soc_pct", "State of charge", "%", "battery", 1, needs_soc=True),
+_SENSORS: Final = {
+    "soc_pct": ("estimate.soc_pct", "State of charge", "%", "battery", 1),
     # A class "battery" of the same unit would make two batteries of one pack.
-    _Sensor(
-        "soc_std_pct",
+    "soc_std_pct": (
         "estimate.soc_std_pct",
         "State of charge, standard deviation",
         "%",
         None,
         2,
-        needs_soc=True,
     ),
-    _Sensor("status", "status", "Status", None, "enum"),
-    _Sensor("current_a", "sample.current_a", "Current", "A", "current", 1),
-    _Sensor("voltage_v", "sample.voltage_v", "Voltage", "V", "voltage", 1),
-    _Sensor(
-        "residual_v", "estimate.residual_v", "Voltage, measured less modelled", "V", "voltage", 3
-    ),
-    _Sensor("temperature_c", "sample.temperature_c", "Temperature", "°C", "temperature", 1),
-    _Sensor("capacity_ah", "health.capacity_ah", "Capacity", "Ah", None, 1),
-    _Sensor(
-        "resistance_ratio",
+    "status": ("status", "Status", None, "enum", None),
+    "current_a": ("sample.current_a", "Current", "A", "current", 1),
+    "voltage_v": ("sample.voltage_v", "Voltage", "V", "voltage", 1),
+    "residual_v": ("estimate.residual_v", "Voltage, measured less modelled", "V", "voltage", 3),
+    "temperature_c": ("sample.temperature_c", "Temperature", "°C", "temperature", 1),
+    "capacity_ah": ("health.capacity_ah", "Capacity", "Ah", None, 1),
+    "resistance_ratio": (
         "health.resistance_ratio",
         "Resistance relative to the model's",
         None,
         None,
         2,
     ),
-    _Sensor("current_offset_a", "health.offset_a", "Current sensor offset", "A", "current", 2),
-    _Sensor(
-        "discharge_a", "power.discharge_a", "Discharge current possible for 10 s", "A", "current", 0
+    "current_offset_a": ("health.offset_a", "Current sensor offset", "A", "current", 2),
+    "discharge_a": (
+        "power.discharge_a",
+        "Discharge current possible for 10 s",
+        "A",
+        "current",
+        0,
     ),
-    _Sensor("charge_a", "power.charge_a", "Charge current possible for 10 s", "A", "current", 0),
-    _Sensor("energy_kwh", "power.energy_wh", "Energy left", "kWh", "energy_storage", 2),
-    _Sensor("weakest_cell", "cells.weakest", "Weakest cell"),
-    _Sensor(
-        "weakest_soc_pct", "cells.soc_pct", "State of charge of the weakest cell", "%", None, 1
+    "charge_a": ("power.charge_a", "Charge current possible for 10 s", "A", "current", 0),
+    "energy_kwh": ("power.energy_wh", "Energy left", "kWh", "energy_storage", 2),
+    "weakest_cell": ("cells.weakest", "Weakest cell", None, None, None),
+    "weakest_soc_pct": (
+        "cells.soc_pct",
+        "State of charge of the weakest cell",
+        "%",
+        None,
+        1,
     ),
-)
+}
+"""Sensors of Home Assistant: place of the state in a status; name, unit, class and digits."""
 
 
 def state(status: Mapping[str, Any]) -> dict[str, Any]:
     """Return the state to publish for a status: one flat JSON object."""
-    values = {sensor.key: value_at(status, sensor.place) for sensor in _SENSORS}
+    values = {key: value_at(status, place) for key, (place, *_) in _SENSORS.items()}
     if (energy_wh := values["energy_kwh"]) is not None:
         values["energy_kwh"] = 1e-3 * energy_wh
     return values | {"reasons": status["reasons"]}
 
 
 class MqttPublisher(Output):
-    """Publish the latest snapshot from a thread, every `every_s` [s].
+    """Publish the latest snapshot on the running loop, every `every_s` [s].
 
     The state is one JSON object at `TOPIC_PREFIX/DEVICE/state`.
     `TOPIC_PREFIX/DEVICE/availability` is "online" or, also by the last will, "offline". Both are
     retained. Without a `discovery_prefix` Home Assistant finds nothing.
+
+    Parameters
+    ----------
+    config : MqttConfig
+    bus : str
+        Name of the service's bus, in the default name of the device.
+
+    Raises
+    ------
+    InputError
+        If the password or the certificates cannot be read.
     """
 
-    def __init__(self, options: MqttOptions) -> None:
-        self._place = f"{options.broker}:{options.port}"
-        self._device, self._every_s = options.device, options.every_s
-        self._discovery_prefix = options.discovery_prefix
-        self._state_topic = f"{options.topic_prefix}/{options.device}/state"
-        self._availability_topic = f"{options.topic_prefix}/{options.device}/availability"
+    def __init__(self, config: MqttConfig, bus: str) -> None:
+        default = re.sub(r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}")
+        self._config, self._device = config, config.device or default
+        port = config.port or (8883 if config.tls else 1883)
+        self._place = f"{config.broker}:{port}"
+        self._state_topic = f"{config.topic_prefix}/{self._device}/state"
+        self._availability_topic = f"{config.topic_prefix}/{self._device}/availability"
         self._latest: Snapshot | None = None
-        self._done = threading.Event()
-        self._is_new = threading.Event()
-        name = f"cangauge-{options.device}"
+        self._is_new = self._is_closed = False
+        name = f"cangauge-{self._device}"
         self._client = client = Client(CallbackAPIVersion.VERSION2, client_id=name)
         client.connect_timeout = CONNECT_WITHIN_S
         client.reconnect_delay_set(*RETRY_S)
         client.will_set(self._availability_topic, "offline", qos=1, retain=True)
         client.max_queued_messages_set(1)
-        if options.user is not None:
-            client.username_pw_set(options.user, options.password)
-        if options.tls:
-            client.tls_set_context(ssl.create_default_context(cafile=options.ca_file))
-        elif options.password is not None and not is_loopback_name(options.broker):
+        password, context = mqtt_password(config), mqtt_tls(config)
+        if config.user is not None:
+            client.username_pw_set(config.user, password)
+        if context is not None:
+            client.tls_set_context(context)
+        elif password is not None and not is_loopback_name(config.broker):
             text = f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]"
             emit(_LOG, logging.WARNING, "mqtt.unencrypted", text)
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_connect_fail = self._on_connect_fail
-        client.connect_async(options.broker, options.port, KEEPALIVE_S)
+        client.connect_async(config.broker, port, KEEPALIVE_S)
         client.loop_start()
-        self._thread = threading.Thread(target=self._run, name="cangauge-mqtt", daemon=True)
-        self._thread.start()
+        self._publishing = asyncio.ensure_future(self._run())
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
@@ -142,45 +147,43 @@ class MqttPublisher(Output):
 
     def close(self) -> None:
         """Say goodbye to the broker, within a limited time."""
-        self._done.set()
-        self._thread.join(2.0 * LEAVE_WITHIN_S)
+        self._is_closed = True
+        self._publishing.cancel()
+        if self._client.is_connected():
+            # A clean end makes the broker forget the last will.
+            self._send(self._availability_topic, "offline").wait_for_publish(LEAVE_WITHIN_S)
+        self._client.disconnect()
 
-    def _run(self) -> None:
-        try:
-            while not self._done.wait(self._every_s):
-                self._publish()
-            if self._client.is_connected():
-                # A clean end makes the broker forget the last will.
-                self._send(self._availability_topic, "offline").wait_for_publish(LEAVE_WITHIN_S)
-            self._client.disconnect()
-        except Exception as error:  # noqa: BLE001 - an error here must not end the page
-            emit(_LOG, logging.ERROR, "mqtt.failed", f"MQTT has ended: {error!r}")
+    async def _run(self) -> None:
+        """Publish; also while the service does not answer, whose latest state grows old."""
+        while True:
+            await asyncio.sleep(self._config.every_s)
+            if self._latest is not None and self._client.is_connected():
+                self._publish(self._latest.at(time.monotonic()))
 
-    def _publish(self) -> None:
-        if self._latest is None or not self._client.is_connected():
-            return
-        status = self._latest.at(time.monotonic())
-        if self._is_new.is_set():
-            self._is_new.clear()
-            if self._discovery_prefix:
-                for sensor in _SENSORS:
-                    topic = f"{self._discovery_prefix}/sensor/{self._device}/{sensor.key}/config"
-                    self._send(topic, json.dumps(self._found(sensor, status), ensure_ascii=False))
+    def _publish(self, status: Mapping[str, Any]) -> None:
+        if self._is_new:
+            self._is_new = False
+            if prefix := self._config.discovery_prefix:
+                for key in _SENSORS:
+                    topic = f"{prefix}/sensor/{self._device}/{key}/config"
+                    self._send(topic, json.dumps(self._found(key, status), ensure_ascii=False))
             self._send(self._availability_topic, "online")
         self._send(self._state_topic, json.dumps(state(status), ensure_ascii=False))
 
-    def _found(self, sensor: _Sensor, status: Mapping[str, Any]) -> dict[str, Any]:
+    def _found(self, key: str, status: Mapping[str, Any]) -> dict[str, Any]:
         """Return Home Assistant's configuration of a sensor."""
+        _, name, unit, device_class, digits = _SENSORS[key]
         availability = [{"topic": self._availability_topic}]
-        if sensor.needs_soc:
+        if key in {"soc_pct", "soc_std_pct"}:
             # An invalid SoC is shown as unavailable, never as a number that looks sound.
             template = "{{ 'offline' if value_json.status == 'invalid' else 'online' }}"
             availability.append({"topic": self._state_topic, "value_template": template})
         content: dict[str, Any] = {
-            "name": sensor.name,
-            "unique_id": f"{self._device}_{sensor.key}",
+            "name": name,
+            "unique_id": f"{self._device}_{key}",
             "state_topic": self._state_topic,
-            "value_template": f"{{{{ value_json.{sensor.key} }}}}",
+            "value_template": f"{{{{ value_json.{key} }}}}",
             "availability": availability,
             "availability_mode": "all",
             "device": {
@@ -190,15 +193,15 @@ class MqttPublisher(Output):
                 "model": status["vehicle"],
                 "sw_version": __version__,
             },
-            "unit_of_measurement": sensor.unit,
-            "device_class": sensor.device_class,
-            "suggested_display_precision": sensor.digits,
+            "unit_of_measurement": unit,
+            "device_class": device_class,
+            "suggested_display_precision": digits,
         }
-        if sensor.device_class == "enum":
+        if device_class == "enum":
             content["options"] = [each.name.lower() for each in Status]
             content["json_attributes_topic"] = self._state_topic
             content["json_attributes_template"] = "{{ {'reasons': value_json.reasons} | tojson }}"
-        elif sensor.key != "weakest_cell":
+        elif key != "weakest_cell":
             content["state_class"] = "measurement"
         return {key: value for key, value in content.items() if value is not None}
 
@@ -212,13 +215,13 @@ class MqttPublisher(Output):
         if reason.is_failure:
             self._emit(logging.WARNING, "mqtt.refused", f"refused the connection: {reason}")
             return
-        self._is_new.set()
+        self._is_new = True
         self._emit(logging.INFO, "mqtt.connected", "connected")
 
     def _on_disconnect(
         self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
     ) -> None:
-        if not self._done.is_set():
+        if not self._is_closed:
             text = f"connection lost ({reason}); the estimate continues"
             self._emit(logging.WARNING, "mqtt.lost", text)
 

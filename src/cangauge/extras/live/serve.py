@@ -7,22 +7,22 @@ One program, a client of the service's status socket. It runs as `cangauge live`
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import os
 import signal
 import sys
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from socket import socket
-from typing import Any, Final
+from typing import Final
 
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError
-from cangauge.extras.live.addresses import HttpAddress, MqttOptions
-from cangauge.service.events import LogFormat, LogLevel, logging_to, release_held
+from cangauge.extras.live.addresses import HttpAddress, http_addresses
+from cangauge.service.config import RunConfig
+from cangauge.service.events import logging_to, release_held
 from cangauge.service.output import Output
 from cangauge.service.status_client import (
     SHOW_EVERY_S,
@@ -37,48 +37,35 @@ NICE: Final = 5
 _LOG = logging.getLogger("cangauge.extras.live")  # this module may be `__main__`
 
 
-@dataclass(frozen=True)
-class Offer:
-    """What a configuration asks to serve, with its secrets.
+def outputs_of(config: RunConfig, bus: str) -> list[Output]:
+    """Return what a configuration asks to serve, on the running loop.
 
     Parameters
     ----------
-    http : HttpAddress or None
-        Of `/status`, `/healthz` and `/metrics`.
-    dashboard : HttpAddress or None
-        Of the live page.
-    mqtt : MqttOptions or None
-        Broker, and what to publish there.
+    config : RunConfig
+    bus : str
+        Name of the service's bus.
+
+    Raises
+    ------
+    InputError
+        If an address cannot be bound, or a secret cannot be read.
     """
+    outputs: list[Output] = []
+    addresses = http_addresses(config)
+    if (address := addresses.get("http")) is not None:
+        from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
 
-    http: HttpAddress | None = None
-    dashboard: HttpAddress | None = None
-    mqtt: MqttOptions | None = None
+        outputs.append(StatusServer(address, _listen(address, "status: http://{}/status")))
+    if (address := addresses.get("dashboard")) is not None:
+        from cangauge.extras.live.server import LivePage  # noqa: PLC0415
 
-    def check_free(self) -> None:
-        """Raise InputError if an address cannot be bound."""
-        for address in (self.http, self.dashboard):
-            if address is not None:
-                address.listen().close()
+        outputs.append(LivePage(address, _listen(address, "live page: http://{}/")))
+    if config.mqtt is not None:
+        from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
 
-    def outputs(self) -> list[Output]:
-        """Return what serves on the running loop; raise InputError as `check_free`."""
-        outputs: list[Output] = []
-        if self.http is not None:
-            from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
-
-            outputs.append(StatusServer(self.http, _listen(self.http, "status: http://{}/status")))
-        if self.dashboard is not None:
-            from cangauge.extras.live.server import LivePage  # noqa: PLC0415
-
-            outputs.append(
-                LivePage(self.dashboard, _listen(self.dashboard, "live page: http://{}/"))
-            )
-        if self.mqtt is not None:
-            from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
-
-            outputs.append(MqttPublisher(self.mqtt))
-        return outputs
+        outputs.append(MqttPublisher(config.mqtt, bus))
+    return outputs
 
 
 def _listen(address: HttpAddress, text: str) -> socket:
@@ -91,34 +78,34 @@ def _listen(address: HttpAddress, text: str) -> socket:
     return listening
 
 
-def serve(endpoint: Path, offer: Offer) -> None:
+def serve(endpoint: Path, config: RunConfig) -> None:
     """Serve until the service ends, or until SIGINT or SIGTERM.
 
     Parameters
     ----------
     endpoint : Path
         Status socket of the service.
-    offer : Offer
+    config : RunConfig
 
     Raises
     ------
     NotRunningError
         If no service answers at the start.
     InputError
-        If an address cannot be bound.
+        As of `outputs_of`.
     """
-    fetch_status(endpoint)
+    bus = fetch_status(endpoint)["bus"]
     with suppress(asyncio.CancelledError):
-        asyncio.run(_serve(endpoint, offer))
+        asyncio.run(_serve(endpoint, config, bus))
 
 
-async def _serve(endpoint: Path, offer: Offer) -> None:
+async def _serve(endpoint: Path, config: RunConfig, bus: str) -> None:
     task = asyncio.current_task()
     assert task is not None  # noqa: S101 - within asyncio.run
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     with ExitStack() as stack:
-        outputs = [stack.enter_context(each) for each in offer.outputs()]
+        outputs = [stack.enter_context(each) for each in outputs_of(config, bus)]
         os.nice(NICE)  # once it has started
         while True:
             began_s = time.monotonic()
@@ -136,24 +123,15 @@ async def _serve(endpoint: Path, offer: Offer) -> None:
             await asyncio.sleep(began_s + SHOW_EVERY_S - time.monotonic())
 
 
-def to_json(endpoint: Path, offer: Offer, log_format: LogFormat, log_level: LogLevel) -> str:
-    """Return what `main` reads."""
-    content = {"endpoint": str(endpoint), "offer": asdict(offer)}
-    return json.dumps(content | {"log_format": log_format, "log_level": log_level})
-
-
 def main() -> None:
-    """Run as a child of `cangauge run`, with `to_json` on stdin: it has secrets."""
-    given = json.load(sys.stdin)
-    kinds: dict[str, type[Any]] = {
-        "http": HttpAddress,
-        "dashboard": HttpAddress,
-        "mqtt": MqttOptions,
-    }
-    asked = {key: kinds[key](**value) for key, value in given["offer"].items() if value is not None}
-    with logging_to(given["log_format"], given["log_level"]):
+    """Run as a child of `cangauge run`, which writes its configuration on stdin.
+
+    `status_socket` there is the path of the socket.
+    """
+    config = RunConfig.model_validate_json(sys.stdin.read())
+    with logging_to(config.log_format, config.log_level):
         try:
-            serve(Path(given["endpoint"]), Offer(**asked))
+            serve(Path(config.status_socket), config)
         except (CangaugeError, RuntimeError) as error:  # RuntimeError: no thread can be started
             emit(_LOG, logging.ERROR, "live.failed", str(error))
             sys.exit(1)

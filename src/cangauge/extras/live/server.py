@@ -10,6 +10,7 @@ import asyncio
 import hashlib
 import hmac
 import json
+import re
 import secrets
 import time
 from contextlib import suppress
@@ -24,11 +25,9 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from cangauge.extras.live.addresses import HttpAddress
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
 from cangauge.extras.live.history import LOG_NAME, REASONS, History, last_hour, shown_columns
-from cangauge.extras.live.http import WRONG_FORMS, Brake, Handler, Nothing, has_token, serve
-from cangauge.service.output import Output
+from cangauge.extras.live.http import WRONG_FORMS, Handler, Nothing, Site
 from cangauge.service.status_client import Snapshot
 
-COOKIE: Final = "cangauge"
 IDLE_S: Final = 30.0
 """Time after which a connection without a request is closed [s]."""
 ALIVE_S: Final = 0.25
@@ -36,45 +35,45 @@ ALIVE_S: Final = 0.25
 _FILES: Final = Path(__file__).with_name("page")
 _OWN: Final = ("enter.html", "live.js", "live.css")
 _BOKEH: Final = "bokeh.min.js"
-_POLICY: Final = (
-    "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:;"
-    " style-src 'self' 'unsafe-inline'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
-)
+_TYPES: Final = {"js": "text/javascript; charset=utf-8", "css": "text/css; charset=utf-8"}
 
 
-class LivePage(Output):
-    """Serve the page on the running loop.
+class LivePage(Site):
+    """Serve the page on the running loop; a viewer must know the token.
 
     Parameters
     ----------
     address : HttpAddress
-        A viewer must know its token.
     listening : socket
         Bound to it.
     """
 
     def __init__(self, address: HttpAddress, listening: socket) -> None:
-        self.token = token = address.token
-        self.brake = Brake()
         self._turn = asyncio.Lock()
         self.history = History()
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
-        # The same after a restart, so that an open page stays logged in; does not reveal the token.
-        self.pass_word = "" if token is None else _cookie_of(token)
         self._news = asyncio.Event()
         self.texts = self._texts()
-        pages: dict[str, type[Handler]] = {
-            "/": _Live,
-            "/enter": _Enter,
-            r"/files/([a-z.]+)": _StaticFile,
-            "/rows": _Rows,
-            "/stream": _Stream,
-            f"/{LOG_NAME}": _LastHour,
-            ".*": _Elsewhere,
-        }
-        limits = {"idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
-        serve(self, listening, pages, limits)
+        if address.token is not None:
+            # The same after a restart, so that an open page stays logged in; does not reveal the
+            # token.
+            key = address.token.encode()
+            self.cookie = hmac.new(key, b"cangauge live page", hashlib.sha256).hexdigest()
+        super().__init__(
+            address,
+            listening,
+            {
+                "/(enter)?": (Entrance, False),
+                r"/files/([a-z.]+)": (StaticFile, False),
+                f"/(rows|{re.escape(LOG_NAME)})": (HistoryPage, True),
+                "/stream": (LiveStream, True),
+                ".*": (Nothing, False),  # browsers ask for /favicon.ico by themselves
+            },
+            "there is nothing here: the live page is at /",
+            idle_connection_timeout=IDLE_S,
+            body_timeout=IDLE_S,
+        )
 
     def _texts(self) -> dict[str, str]:
         """Return the files of the page by their names."""
@@ -142,78 +141,67 @@ class LivePage(Output):
         }
 
 
-class _LiveHandler(Handler):
-    """A page that takes the cookie as well as a bearer token."""
+class Entrance(Handler):
+    """The page, and the form that asks for the token."""
 
-    def set_default_headers(self) -> None:
-        super().set_default_headers()
-        self.set_header("Referrer-Policy", "no-referrer")
-        self.set_header("Content-Security-Policy", _POLICY)
-
-    def is_known(self, token: str) -> bool:
-        given = self.get_cookie(COOKIE, "") or ""
-        same = hmac.compare_digest(given.encode(), self.server.pass_word.encode())
-        return same or super().is_known(token)
-
-
-class _Live(_LiveHandler):
-    def refuse_unknown(self) -> None:
-        self.redirect("/enter")
-
-    def get(self) -> None:
-        self.finish(self.server.texts["live.html"])
-
-
-class _Enter(_LiveHandler):
-    needs_token = False
-
-    def get(self) -> None:
-        self.finish(self.server.texts["enter.html"])
-
-    def post(self) -> None:
-        token = self.server.token
-        given, peer = self.get_body_argument("token", ""), str(self.request.remote_ip)
-        self.server.brake.check(peer, WRONG_FORMS)
-        if token is not None and not has_token(f"Bearer {given}", token):
-            self.server.brake.note_wrong(peer)
-            self.set_status(401)
-            self.finish(self.server.texts["enter.html"])
+    def get(self, form: str | None) -> None:
+        """Send the page to a viewer who has the token, else to the form."""
+        if form is None and not self.has_token():
+            self.redirect("/enter")
             return
-        self.set_cookie(
-            COOKIE, self.server.pass_word, httponly=True, samesite="Strict", expires_days=None
-        )
+        self.finish(self.site.texts["live.html" if form is None else "enter.html"])
+
+    def post(self, _: str | None) -> None:
+        """Take the token from the form."""
+        header, peer = f"Bearer {self.get_body_argument('token', '')}", str(self.request.remote_ip)
+        if not self.site.check_token(header, peer, WRONG_FORMS):
+            self.set_status(401)
+            self.finish(self.site.texts["enter.html"])
+            return
+        if self.site.cookie is not None:
+            self.set_cookie(
+                "cangauge", self.site.cookie, httponly=True, samesite="Strict", expires_days=None
+            )
         self.redirect("/")
 
 
-class _StaticFile(_LiveHandler):
-    needs_token = False
-    _TYPES: Final = {"js": "text/javascript; charset=utf-8", "css": "text/css; charset=utf-8"}
+class StaticFile(Handler):
+    """Scripts and styles of the page."""
 
     def get(self, name: str) -> None:
-        kind = self._TYPES.get(name.rpartition(".")[2])
-        if kind is None or name not in self.server.texts:
+        """Send a file of the page."""
+        kind = _TYPES.get(name.rpartition(".")[2])
+        if kind is None or name not in self.site.texts:
             self.refuse(404, "no such file")
             return
         self.set_header("Content-Type", kind)
-        self.finish(self.server.texts[name])
+        self.finish(self.site.texts[name])
 
 
-class _Rows(_LiveHandler):
-    async def get(self) -> None:
-        """Return the status, what is wrong, and the rows of a span after those already known."""
-        name, key, after = (self.get_query_argument(part, "") for part in ("span", "key", "after"))
+class HistoryPage(Handler):
+    """HistoryPage of the history: those that a viewer lacks, or a log of the last hour."""
+
+    async def get(self, name: str) -> None:
+        """Send the status, what is wrong, and the rows of a span after those already known."""
+        await self.site.in_turn()
+        if name == LOG_NAME:
+            self.set_header("Content-Type", "text/csv; charset=utf-8")
+            self.set_header("Content-Disposition", f'attachment; filename="{LOG_NAME}"')
+            self.finish(last_hour(self.site.history))
+            return
+        span, key, after = (self.get_query_argument(part, "") for part in ("span", "key", "after"))
         number = int(after) if after.isdecimal() and len(after) < 16 else 0
-        await self.server.in_turn()
-        self.send_json(self.server.answer(name, key, number))
+        self.send_json(self.site.answer(span, key, number))
 
 
-class _Stream(_LiveHandler, WebSocketHandler):
+class LiveStream(WebSocketHandler, Handler):
     """Send what `/rows` answers, as it comes: from each question of the viewer on.
 
     The next message is made once the viewer's connection has taken the one before.
     """
 
     def open(self, *_: str, **__: str) -> None:
+        """Wait for a question."""
         self._question: dict[str, Any] = {}
         self._is_asked = asyncio.Event()
         self._sending = asyncio.ensure_future(self._send())
@@ -228,6 +216,7 @@ class _Stream(_LiveHandler, WebSocketHandler):
         self._is_asked.set()
 
     def on_close(self) -> None:
+        """End."""
         self._sending.cancel()
 
     async def _send(self) -> None:
@@ -237,25 +226,8 @@ class _Stream(_LiveHandler, WebSocketHandler):
                 question = self._question
                 name, key, after = (question.get(part) for part in ("span", "key", "after"))
                 number = after if isinstance(after, int) and after >= 0 else 0
-                await self.server.in_turn()
-                answer = self.server.answer(str(name), str(key), number)
+                await self.site.in_turn()
+                answer = self.site.answer(str(name), str(key), number)
                 self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
                 await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
-                await self.server.news()
-
-
-class _LastHour(_LiveHandler):
-    async def get(self) -> None:
-        self.set_header("Content-Type", "text/csv; charset=utf-8")
-        self.set_header("Content-Disposition", f'attachment; filename="{LOG_NAME}"')
-        await self.server.in_turn()
-        self.finish(last_hour(self.server.history))
-
-
-class _Elsewhere(_LiveHandler, Nothing):
-    needs_token = False  # browsers ask for /favicon.ico by themselves
-    text = "there is nothing here: the live page is at /"
-
-
-def _cookie_of(token: str) -> str:
-    return hmac.new(token.encode(), b"cangauge live page", hashlib.sha256).hexdigest()
+                await self.site.news()
