@@ -25,7 +25,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
 from cangauge.service.status import Monitor
 from cangauge.service.status_client import Snapshot, StatusSocket
-from live import LoggedLines, in_process, leaf_model, leaf_model_path, loop_config, waits
+from live import Command, LoggedLines, leaf_model, leaf_model_path, loop_config, waits
 from running import free_port
 from served import Served
 
@@ -333,12 +333,16 @@ def test_the_live_command_finds_the_service_of_its_configuration(
     states_socket: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
-    endpoint = tmp_path / "own.sock" if states_socket else tmp_path / "run" / "virtual-x.sock"
-    line = f'status_socket = "{endpoint}"\n' if states_socket else ""
+    own = tmp_path / "own.sock" if states_socket else tmp_path / "run" / "virtual-found-by-bus.sock"
+    lines = [f'model = "{leaf_model_path()}"', 'http = "0"', 'interface = "virtual"']
+    lines += ['channel = "found by bus"', f'status_socket = "{own if states_socket else "auto"}"']
     config = tmp_path / "car.toml"
-    config.write_text(f'model = "{leaf_model_path()}"\nhttp = "0"\n{line}')
-    found: list[Path] = []
-    monkeypatch.setattr("cangauge.extras.live.serve.serve", lambda path, _offer: found.append(path))
-    with closing(StatusSocket(endpoint, lambda: snapshot().status)):
-        assert in_process("live", config).code == 0
-    assert found == [endpoint]
+    config.write_text("\n".join(lines))
+    other = StatusSocket(tmp_path / "run" / "other.sock", dict)
+    with closing(other), closing(StatusSocket(own, lambda: snapshot().status)) as service:
+        live = Command("live", config)
+        live.wait_for("http.listening")
+        service.close()
+        ended = live.end()
+    assert ended.code == 0
+    assert f"the service at {own} has ended" in ended.err

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -279,17 +279,18 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path
     """Open the status socket; return its path, or None if it is off or not to be had."""
     if config.status_socket == "off":
         return None
-    is_auto = config.status_socket == "auto"
-    path = socket_path(monitor.latest.status["bus"]) if is_auto else Path(config.status_socket)
+    if config.status_socket != "auto":
+        path = Path(config.status_socket)
+        stack.enter_context(closing(StatusSocket(path, monitor.now)))
+        return path
+    path = socket_path(monitor.latest.status["bus"])
     try:
         server = StatusSocket(path, monitor.now)
     except CangaugeError as error:
-        if not is_auto:
-            raise
         # Not requested explicitly: the service runs without it.
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
         return None
-    stack.callback(server.close)
+    stack.enter_context(closing(server))
     return path
 
 

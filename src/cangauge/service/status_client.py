@@ -196,13 +196,21 @@ def is_served(path: Path) -> bool:
         return path.is_socket() and not isinstance(error, ConnectionRefusedError)
 
 
-def find_socket() -> Path:
-    """Return the socket of the running service; NotRunningError: none, InputError: several."""
+def find_socket(name: str = "*.sock") -> Path:
+    """Return the socket of the running service, if several by its name.
+
+    Raises
+    ------
+    NotRunningError
+        If there is none.
+    InputError
+        If there are several.
+    """
     found: list[Path] = []
     with suppress(OSError):  # a folder that this user may not read
         own = [each for each in runtime_folders() if not _is_anothers(each)]
         for folder in (*own, SYSTEM_FOLDER, *SYSTEM_FOLDER.glob("*")):
-            found += [each for each in sorted(folder.glob("*.sock")) if is_served(each)]
+            found += [each for each in sorted(folder.glob(name)) if is_served(each)]
     found = list(dict.fromkeys(found))
     if not found:
         raise NotRunningError(
