@@ -31,6 +31,7 @@ import cantools
 import numpy as np
 from rich.table import Table
 
+from cangauge import simulate
 from cangauge._resources import shared_file
 from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
@@ -40,7 +41,6 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import run_estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.validation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log

@@ -20,8 +20,8 @@ import cantools
 import numpy as np
 import typer
 
+from cangauge import simulate
 from cangauge.cli.app import COMMANDS, load_command
-from cangauge.extras.validation import simulate
 from cangauge.model.effects.library import LIBRARY
 from cangauge.service.config import reference
 from cangauge.types import REASON_WORDS, reason_name

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from cangauge.estimation.offline import estimate as estimate
     from cangauge.extras.judge.judgement import judge as judge
     from cangauge.extras.judge.result import Judgement as Judgement
-    from cangauge.extras.validation import Simulation as Simulation
-    from cangauge.extras.validation import simulate as simulate
+    from cangauge.extras.validation.twin.simulation import Simulation as Simulation
+    from cangauge.extras.validation.twin.simulation import simulate as simulate
     from cangauge.identify.fit import fit as fit
     from cangauge.identify.identification import Identification as Identification
     from cangauge.logs.log import Log as Log
@@ -68,7 +68,7 @@ _PLACES: Final = {
     "Model": "model.model_file",
     "Sample": "types",
     "Service": "service.run",
-    "Simulation": "extras.validation",
+    "Simulation": "extras.validation.twin.simulation",
     "Vehicle": "bus.vehicle",
     "__version__": "_version",
     "diagnose": "diagnosis",
@@ -76,7 +76,7 @@ _PLACES: Final = {
     "fit": "identify.fit",
     "judge": "extras.judge.judgement",
     "read_log": "bus.recording",
-    "simulate": "extras.validation",
+    "simulate": "extras.validation.twin.simulation",
 }
 """Module of each public name."""
 __all__ = list(_PLACES)

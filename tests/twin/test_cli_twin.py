@@ -12,9 +12,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from cangauge import simulate
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
-from cangauge.extras.validation import simulate
 from cangauge.extras.validation.twin import simulation
 from cangauge.extras.validation.twin.faults import parse_effect
 from cangauge.extras.validation.twin.pack import TwinPack

@@ -17,8 +17,8 @@ from cangauge.extras.validation.twin.faults import (
     is_reached,
 )
 from cangauge.extras.validation.twin.pack import TwinPack
-from cangauge.extras.validation.twin.plant import (
-    Truth,
+from cangauge.extras.validation.twin.physics import (
+    Response,
     cole_cole,
     finite_warburg,
     simulate_truth,
@@ -71,7 +71,7 @@ def demanding_drive(pack: TwinPack) -> Drive:
 
 
 @pytest.fixture(scope="module")
-def healthy(pack: TwinPack, demanding_drive: Drive) -> Truth:
+def healthy(pack: TwinPack, demanding_drive: Drive) -> Response:
     return simulate_truth(pack, demanding_drive)
 
 
@@ -82,7 +82,7 @@ def test_faults_of_the_library_are_complete() -> None:
 
 @pytest.mark.parametrize("fault_id", nightly_except(IN_SUITE, ALL))
 def test_fault_is_scaled_to_the_gap(
-    fault_id: str, pack: TwinPack, demanding_drive: Drive, healthy: Truth
+    fault_id: str, pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     wanted = Fault(fault_id, 1.0, seed=2)
     fault, reached_v = scale_to_gap(pack, demanding_drive, wanted, WANTED_V, healthy)
@@ -110,7 +110,7 @@ def test_fault_of_size_zero_changes_nothing(fault_id: str) -> None:
     ),
 )
 def test_negative_fault_opens_the_opposite_gap(
-    fault_id: str, pack: TwinPack, demanding_drive: Drive, healthy: Truth
+    fault_id: str, pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     fault, _ = scale_to_gap(pack, demanding_drive, Fault(fault_id, 1.0), 0.2, healthy)
     gaps = []
@@ -124,7 +124,7 @@ def test_negative_fault_opens_the_opposite_gap(
 
 
 def test_sensor_faults_leave_the_truth_unchanged(
-    pack: TwinPack, demanding_drive: Drive, healthy: Truth
+    pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     for fault in (
         Fault("current_offset", 2.0), Fault("current_gain", 0.05), Fault("voltage_offset", 1.0),
@@ -137,7 +137,7 @@ def test_sensor_faults_leave_the_truth_unchanged(
 
 
 def test_time_skew_delays_the_current(
-    pack: TwinPack, demanding_drive: Drive, healthy: Truth
+    pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     condition = Faults.of([Fault("time_skew", 2.0)])
     measured = read_drive(pack, demanding_drive, condition, healthy).current_a
@@ -157,7 +157,7 @@ def test_charge_faults_shift_the_true_soc(pack: TwinPack, demanding_drive: Drive
 
 
 def test_resistance_step_acts_from_its_time_on(
-    pack: TwinPack, demanding_drive: Drive, healthy: Truth
+    pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     fault = Fault("resistance_step", 0.02, {"at_s": 2000.0})
     truth = simulate_truth(pack, demanding_drive, Faults.of([fault]), healthy)
@@ -170,7 +170,7 @@ def test_resistance_step_acts_from_its_time_on(
 
 
 def test_asymmetry_acts_during_charge_only(
-    pack: TwinPack, demanding_drive: Drive, healthy: Truth
+    pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     condition = Faults.of([Fault("resistance_asymmetry", 0.05)])
     truth = simulate_truth(pack, demanding_drive, condition, healthy)

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cangauge import simulate
 from cangauge.errors import InputError
-from cangauge.extras.validation import gap_check, simulate
+from cangauge.extras.validation import gap_check
 from cangauge.extras.validation.twin.faults import Fault, fault_kind
 from cangauge.extras.validation.twin.injection import (
-    Injected,
     fit_surrogate_pack,
     inject,
     scale_injection,
 )
 from cangauge.extras.validation.twin.pack import TwinPack
-from cangauge.extras.validation.twin.recording import rms
+from cangauge.extras.validation.twin.recording import Recording, rms
 from cangauge.logs.log import Log
 from cangauge.model.effects.library import LIBRARY
 
@@ -35,7 +35,7 @@ def surrogate(log: Log) -> TwinPack:
     return replace(found, sensors=replace(found.sensors, current_step_a=0.0, voltage_step_v=0.0))
 
 
-def injected(log: Log, surrogate: TwinPack, *faults: Fault) -> Injected:
+def injected(log: Log, surrogate: TwinPack, *faults: Fault) -> Recording:
     return inject(log, faults, surrogate)
 
 
@@ -93,12 +93,12 @@ def test_a_check_counts_what_was_found_at_each_size() -> None:
     assert ["current reading", "1/2, 1/1", "1/1, 1/1", "–"] in rows
     assert "first in 67 % of 3 injected effects" in gap_check.summary(result)
     with pytest.raises(InputError, match="3 healthy logs are too few"):
-        gap_check.CheckedPack.of_logs([simulate(seed=1, hours=0.1).log] * 3, 60.0, 96)
+        gap_check.own_pack([simulate(seed=1, hours=0.1).log] * 3, 60.0, 96)
 
 
 def test_each_log_is_left_out_in_turn() -> None:
     """The first log as it is, then with the first effect at one floor."""
-    findings = gap_check.CheckedPack.simulated().findings(1)
+    findings = gap_check.find(*gap_check.simulated_logs(), 1)
     healthy, faulty = next(findings), next(findings)
     assert (healthy.effect, healthy.detected) == (None, False)
     assert (faulty.effect, faulty.unit) == ("current_offset", fault_kind("current_offset").unit)

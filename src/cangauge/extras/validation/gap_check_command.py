@@ -54,34 +54,27 @@ def gap_check_command(
 
     `cangauge gap-check --at-most 2`
     """
-    from cangauge.extras.validation.gap_check import (
-        PER_LOG,
-        CheckedPack,
-        summarize,
-        summary,
-        table,
-    )
+    from cangauge.extras.validation import gap_check
 
-    if logs:
-        if capacity_ah is None:
-            raise InputError(
-                "unknown capacity of the pack", field="--capacity-ah", cure="give it in Ah"
-            )
-        read = [reading.load(path) for path in logs]
-        pack = CheckedPack.of_logs(read, capacity_ah, cells)
+    read = [reading.load(path) for path in logs or []]
+    if not read:
+        healthy, pack = gap_check.simulated_logs()
+    elif capacity_ah is None:
+        problem, cure = "unknown capacity of the pack", "give it in Ah"
+        raise InputError(problem, field="--capacity-ah", cure=cure)
     else:
-        read, pack = [], CheckedPack.simulated()
-    left_out = min(at_most or len(pack.logs), len(pack.logs))
-    note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
+        healthy, pack = read, gap_check.own_pack(read, capacity_ah, cells)
+    diagnoses = min(at_most or len(healthy), len(healthy)) * gap_check.PER_LOG
+    note(f"at most {diagnoses} diagnoses, about half a second each")
     findings = []
     with progress() as show_line:
-        for finding in pack.findings(at_most):
+        for finding in gap_check.find(healthy, pack, at_most):
             findings.append(finding)
             show_line(f"{len(findings)} diagnoses")
-    result = summarize(findings)
+    result = gap_check.summarize(findings)
 
     def show() -> None:
-        typer.echo(summary(result))
-        print_table("Right fault first, stated alone and right", *table(result))
+        typer.echo(gap_check.summary(result))
+        print_table("Right fault first, stated alone and right", *gap_check.table(result))
 
     finish(result | {"assumed": assumed_of(read)}, show, as_json=json_output)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import Final
+from functools import cache, cached_property
+from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import brentq
@@ -87,15 +87,12 @@ class FaultKind:
         return low * unit, high * unit
 
 
-def _kinds() -> dict[str, FaultKind]:
-    found = {}
-    for fault_id, stated in read_table("faults.toml").items():
-        shape = {name: ShapeRange(**of) for name, of in stated.pop("shape", {}).items()}
-        found[fault_id] = FaultKind(fault_id, **stated, shape=shape)
-    return found
+def _kind(fault_id: str, stated: dict[str, Any]) -> FaultKind:
+    shape = {name: ShapeRange(**of) for name, of in stated.pop("shape", {}).items()}
+    return FaultKind(fault_id, **stated, shape=shape)
 
 
-_KINDS: Final = _kinds()
+_KINDS: Final = {name: _kind(name, stated) for name, stated in read_table("faults.toml").items()}
 
 
 def fault_kinds(*, outside: bool = False) -> tuple[FaultKind, ...]:
@@ -135,21 +132,21 @@ class Fault:
         """Kind of the fault."""
         return fault_kind(self.id)
 
+    @cached_property
     def full_shape(self) -> dict[str, float]:
-        """Return all shape parameters, given or drawn."""
+        """All shape parameters, given or drawn."""
         rng = np.random.default_rng(self.seed)
         drawn = {name: values.draw(rng) for name, values in self.kind.shape.items()}
-        return drawn | dict(self.shape)
+        return {**drawn, **self.shape}
 
     def is_active(self, time_s: FloatArray) -> BoolArray:
         """Return where a fault that comes and goes is active, shape (n,); it starts inactive.
 
         Its phases last `on_s` (stale frames: its size) and `off_s` on average.
         """
-        shape = {"on_s": self.size} | self.full_shape()
+        shape = {"on_s": self.size, **self.full_shape}
         on_s, off_s = shape["on_s"], shape["off_s"]
-        span_s = float(time_s[-1] - time_s[0])
-        pairs = max(4, int(2.0 * span_s / (on_s + off_s)) + 4)
+        pairs = int(2.0 * float(time_s[-1] - time_s[0]) / (on_s + off_s)) + 4
         # Drawn in pairs, so that another duration stretches the same sequence.
         lengths = np.random.default_rng(self.seed).exponential(1.0, (pairs, 2)) * (off_s, on_s)
         edges = time_s[0] + np.cumsum(lengths.ravel())

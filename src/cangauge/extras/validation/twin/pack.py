@@ -1,28 +1,27 @@
 """Simulated packs: cell chemistry, size, impedance, thermal masses and sensors; drawn at random.
 
-A monotone cubic (PCHIP, Fritsch and Butland 1984) interpolates the tables of `cells.toml`; every
+A monotone cubic (PCHIP, Fritsch and Butland 1984) interpolates the tables of `packs.toml`; every
 specimen deviates from them by some millivolts.
 """
 
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 
 KELVIN: Final = 273.15
-LOWEST, HIGHEST = -0.06, 1.04
-"""SoC range of the tables [-]: a weak cell is discharged below its 0 %."""
-_POINTS: Final = 2201
-_BEND_V: Final = 0.006
-"""Deviation of a specimen from its table [V]."""
+GRID: Final = np.linspace(-0.06, 1.04, 2201)
+"""SoC of the tables [-]: a weak cell is discharged below its 0 %."""
 THERMAL_V: Final = 0.02569
 """R·T/F at 25 °C [V]."""
 
@@ -32,8 +31,9 @@ def read_table(name: str) -> dict[str, Any]:
     return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
 
 
-_CELLS: Final = read_table("cells.toml")
-CHEMISTRIES: Final = tuple(_CELLS)
+_TABLE: Final = read_table("packs.toml")
+KINDS: Final = tuple(_TABLE["kinds"])
+CHEMISTRIES: Final = tuple(_TABLE["cells"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,29 +43,42 @@ class CellChemistry:
     Parameters
     ----------
     name : str
-    grid : array of shape (m,)
-        State of charge [-], evenly spaced from `LOWEST` to `HIGHEST`.
     ocv_table_v : array of shape (m,)
-        Open-circuit voltage at 25 °C [V], strictly rising.
+        Open-circuit voltage at 25 °C [V] over `GRID`, strictly rising.
     entropy_table_v_k : array of shape (m,)
-        dU/dT [V/K].
+        dU/dT over `GRID` [V/K].
     """
 
     name: str
-    grid: FloatArray
     ocv_table_v: FloatArray
     entropy_table_v_k: FloatArray
 
+    @classmethod
+    def tabulated(
+        cls, name: str, soc: ArrayLike, volts: FloatArray, bend_v: ArrayLike, entropy: str
+    ) -> CellChemistry:
+        """Return the cell of a table over the SoC, with a bend over `GRID` [V].
+
+        The table is extended beyond both ends, for weak and overcharged cells; `entropy` is the
+        chemistry of the tabulated dU/dT.
+        """
+        soc = np.concatenate(([-0.06, -0.03], soc, [1.04]))
+        volts = np.concatenate((volts[0] - [1.35, 0.62], volts, [volts[-1] + 0.12]))
+        table_v = np.maximum.accumulate(PchipInterpolator(soc, volts)(GRID) + bend_v)
+        soc_pct, entropy_mv_k = np.array(_TABLE["cells"][entropy]["entropy_mv_k"]).T
+        curve = PchipInterpolator(soc_pct / 100.0, entropy_mv_k * 1e-3)
+        return cls(name, table_v + 1e-6 * GRID, curve(np.clip(GRID, 0.0, 1.0)))
+
     def ocv(self, soc: FloatArray) -> FloatArray:
         """Return the open-circuit voltage of one cell at 25 °C [V]; soc [-] of any shape."""
-        return np.interp(soc, self.grid, self.ocv_table_v)
+        return np.interp(soc, GRID, self.ocv_table_v)
 
     def entropy(self, soc: FloatArray) -> FloatArray:
         """Return dU/dT of one cell [V/K]; soc [-] of any shape."""
-        return np.interp(soc, self.grid, self.entropy_table_v_k)
+        return np.interp(soc, GRID, self.entropy_table_v_k)
 
 
-def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -> CellChemistry:
+def chemistry(name: str, rng: np.random.Generator) -> CellChemistry:
     """Draw one specimen of a chemistry, some millivolts off its table.
 
     Parameters
@@ -73,32 +86,22 @@ def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -
     name : {"nmc", "lmo", "nca", "lfp"}
         `lmo` is the LMO-rich blend of the first Leafs.
     rng : Generator
-    entropy_scale : float
-        Factor on dU/dT [-].
 
     Raises
     ------
     InputError
         For an unknown chemistry.
     """
-    if name not in _CELLS:
+    if name not in CHEMISTRIES:
         raise InputError("unknown chemistry", value=name, cure=f"use {', '.join(CHEMISTRIES)}")
-    soc_pct, volts = np.array(_CELLS[name]["ocv_v"]).T
-    # Extended beyond both ends, for weak and overcharged cells.
-    soc_pct = np.concatenate(([-6.0, -3.0], soc_pct, [104.0]))
-    volts = np.concatenate(([volts[0] - 1.35, volts[0] - 0.62], volts, [volts[-1] + 0.12]))
-    grid = np.linspace(LOWEST, HIGHEST, _POINTS)
-    table = PchipInterpolator(soc_pct / 100.0, volts)(grid)
-    # A slow wave; smaller for the flat table of LFP, which must keep rising.
+    soc_pct, volts = np.array(_TABLE["cells"][name]["ocv_v"]).T
     waves = sum(
-        rng.normal() / order * np.sin(order * np.pi * grid + rng.uniform(0.0, 2.0 * np.pi))
+        rng.normal() / order * np.sin(order * np.pi * GRID + rng.uniform(0.0, 2.0 * np.pi))
         for order in (1, 2, 3)
     )
-    size = _BEND_V * (0.05 if name == "lfp" else 1.0)
-    table = np.maximum.accumulate(table + size * waves) + 1e-6 * grid
-    soc_pct, entropy = np.array(_CELLS[name]["entropy_mv_k"]).T
-    curve = PchipInterpolator(soc_pct / 100.0, entropy * 1e-3)
-    return CellChemistry(name, grid, table, curve(np.clip(grid, 0.0, 1.0)) * entropy_scale)
+    # A slow wave of 6 mV; smaller for the flat table of LFP, which must keep rising.
+    bend_v = waves * (0.0003 if name == "lfp" else 0.006)
+    return CellChemistry.tabulated(name, soc_pct / 100.0, volts, bend_v, name)
 
 
 @dataclass(frozen=True)
@@ -133,6 +136,23 @@ class Sensors:
     jitter: float = 0.0
     drop_share: float = 0.0
     start_soc_std_pct: float = 0.0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, pack_v: float, capacity_ah: float) -> Sensors:
+        """Draw the sensors of a pack of a nominal voltage [V] and capacity [Ah]."""
+        steps_v = (0.05, 0.1, 0.25, 0.5) if pack_v > 100.0 else (0.005, 0.01, 0.02)
+        return cls(
+            current_step_a=float(rng.choice((0.02, 0.05, 0.1, 0.25, 0.5))),
+            current_noise_a=capacity_ah * rng.uniform(0.0004, 0.003),
+            voltage_step_v=float(rng.choice(steps_v)),
+            voltage_noise_v=pack_v * rng.uniform(0.0001, 0.0005),
+            temperature_step_k=float(rng.choice((0.1, 0.25, 0.5, 1.0))),
+            temperature_lag_s=rng.uniform(5.0, 30.0),
+            rate_hz=float(rng.choice((1.0, 2.0, 5.0, 10.0), p=(0.6, 0.2, 0.1, 0.1))),
+            jitter=rng.uniform(0.0, 0.06),
+            drop_share=float(rng.choice((0.0, rng.uniform(0.0005, 0.006)))),
+            start_soc_std_pct=rng.uniform(0.02, 0.12),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +227,7 @@ class TwinPack:
     @property
     def nominal_v(self) -> float:
         """Open-circuit voltage at 50 % SoC [V]."""
-        return float(self.cells * self.chemistry.ocv(np.array([0.5]))[0])
+        return float(self.cells * self.chemistry.ocv(np.array(0.5)))
 
     @property
     def energy_kwh(self) -> float:
@@ -220,20 +240,15 @@ class TwinPack:
         return self.cells * (self.ohmic_ohm + THERMAL_V / self.exchange_a) + self.busbar_ohm
 
 
-# Kind → odds, cells in series, capacity range [Ah], probability of each chemistry.
-KINDS: Final[dict[str, tuple[int, int, float, float, dict[str, float]]]] = {
-    "leaf24": (3, 96, 48.0, 66.0, {"lmo": 1.0}),
-    "leaf40": (2, 96, 100.0, 116.0, {"nmc": 1.0}),
-    "car60": (2, 96, 140.0, 168.0, {"nmc": 0.6, "nca": 0.4}),
-    "car60lfp": (1, 106, 150.0, 165.0, {"lfp": 1.0}),
-    "compact": (2, 108, 55.0, 94.0, {"nmc": 0.8, "nca": 0.2}),
-    "module12": (1, 12, 30.0, 120.0, {"nmc": 0.5, "lmo": 0.3, "nca": 0.2}),
-}
-
-
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw uniformly in the logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def pick(rng: np.random.Generator, odds: Mapping[str, float]) -> str:
+    """Draw a name by its odds."""
+    p = np.array(list(odds.values()), dtype=float)
+    return str(rng.choice(list(odds), p=p / p.sum()))
 
 
 def draw_pack(
@@ -254,19 +269,18 @@ def draw_pack(
     InputError
         For an unknown kind or chemistry.
     """
+    kinds = _TABLE["kinds"]
     if kind is None:
-        odds = np.array([each[0] for each in KINDS.values()], dtype=float)
-        kind = str(rng.choice(list(KINDS), p=odds / odds.sum()))
-    if kind not in KINDS:
+        kind = pick(rng, {name: each["odds"] for name, each in kinds.items()})
+    if kind not in kinds:
         raise InputError("unknown pack", value=kind, cure=f"use {', '.join(KINDS)}")
-    _, cells, low_ah, high_ah, names = KINDS[kind]
-    capacity_ah = rng.uniform(low_ah, high_ah)
-    name = str(rng.choice(list(names), p=list(names.values())))
-    entropy_scale = float(np.exp(rng.uniform(-0.2, 1.1)))
-    specimen = chemistry(chemistry_name or name, rng, entropy_scale)
+    cells, capacity_ah = kinds[kind]["cells"], rng.uniform(*kinds[kind]["capacity_ah"])
+    usual = pick(rng, kinds[kind]["chemistry"])
+    entropy = float(np.exp(rng.uniform(-0.2, 1.1)))
+    cell = chemistry(chemistry_name or usual, rng)
     # Overpotential of one cell at 1C, divided among the processes.
     volts = rng.uniform(0.050, 0.095)
-    share = rng.dirichlet(np.array([9.0, 5.0, 3.0]))
+    share = rng.dirichlet([9.0, 5.0, 3.0])
     ohmic, transfer, electrolyte = (volts * share / capacity_ah).tolist()
     slow_s = log_uniform(rng, 12.0, 28.0)
     split = rng.uniform(0.4, 0.7)
@@ -277,7 +291,7 @@ def draw_pack(
     quantiles = np.array([-1.75, -0.85, 0.0, 0.85, 1.75])  # of the cell spread, for the groups
     return TwinPack(
         name=kind,
-        chemistry=specimen,
+        chemistry=replace(cell, entropy_table_v_k=entropy * cell.entropy_table_v_k),
         cells=cells,
         capacity_ah=capacity_ah,
         weights=np.array([0.1, 0.2, 0.4, 0.2, 0.1]) * cells,
@@ -300,21 +314,5 @@ def draw_pack(
         surface_j_k=0.25 * heat_j_k,
         core_surface_w_k=energy_kwh * rng.uniform(4.0, 10.0),
         surface_ambient_w_k=heat_j_k / rng.uniform(9000.0, 30000.0),
-        sensors=_draw_sensors(rng, cells * 3.7, capacity_ah),
-    )
-
-
-def _draw_sensors(rng: np.random.Generator, pack_v: float, capacity_ah: float) -> Sensors:
-    is_car = pack_v > 100.0
-    return Sensors(
-        current_step_a=float(rng.choice((0.02, 0.05, 0.1, 0.25, 0.5))),
-        current_noise_a=capacity_ah * rng.uniform(0.0004, 0.003),
-        voltage_step_v=float(rng.choice((0.05, 0.1, 0.25, 0.5) if is_car else (0.005, 0.01, 0.02))),
-        voltage_noise_v=pack_v * rng.uniform(0.0001, 0.0005),
-        temperature_step_k=float(rng.choice((0.1, 0.25, 0.5, 1.0))),
-        temperature_lag_s=rng.uniform(5.0, 30.0),
-        rate_hz=float(rng.choice((1.0, 2.0, 5.0, 10.0), p=(0.6, 0.2, 0.1, 0.1))),
-        jitter=rng.uniform(0.0, 0.06),
-        drop_share=float(rng.choice((0.0, rng.uniform(0.0005, 0.006)))),
-        start_soc_std_pct=rng.uniform(0.02, 0.12),
+        sensors=Sensors.draw(rng, cells * 3.7, capacity_ah),
     )

@@ -13,7 +13,7 @@ from cangauge.errors import require_number
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, is_reached, parse_effect
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.plant import simulate_truth
+from cangauge.extras.validation.twin.physics import simulate_truth
 from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, scale_to_gap
 from cangauge.logs.log import Log
 
@@ -67,7 +67,7 @@ class Simulation:
                     "parameter": fault.kind.parameter,
                     "value": fault.size,
                     "unit": fault.kind.unit,
-                    "shape": fault.full_shape(),
+                    "shape": fault.full_shape,
                 }
                 for fault in self.faults
             ],
@@ -125,7 +125,7 @@ def simulate(
 
     Examples
     --------
-    >>> from cangauge.extras.validation import simulate
+    >>> from cangauge import simulate
     >>> trip = simulate("current_offset:offset_a=4", seed=1, hours=0.2)
     >>> trip.faults[0].size
     4.0
@@ -161,7 +161,6 @@ def simulate(
                 )
         faults.append(fault)
     recording = record_drive(drawn, load, faults, name=name, healthy=healthy)
-    soc_pct = recording.true_soc_pct.copy()
-    soc_pct[0] = recording.assumed_start_pct
+    soc_pct = np.append(recording.assumed_start_pct, recording.true_soc_pct[1:])
     log = replace(recording.log, soc_pct=soc_pct)
     return Simulation(log, recording, drawn, tuple(faults), tuple(notes))
