@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, open_bus
+from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
@@ -101,8 +101,8 @@ def over_bus(
     done = threading.Event()
     bus = open_bus(address, pipeline.filters)
     with (
-        BusConnection(bus, str(address), backend_capabilities(address)) as receiver,
-        BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as sender,
+        BusConnection(bus, address) as receiver,
+        BusConnection(open_bus(address, [standard_filter(0x5A1)]), address) as sender,
         Recorder(record) as recorder,
     ):
         outputs = [_Rows(rows), recorder]

@@ -47,7 +47,7 @@ def estimates_from_64_bytes(address: BusAddress, folder: Path) -> None:
     pipeline = Pipeline(car, leaf_model(), PipelineSettings())
     with (
         Recorder(path) as recorder,
-        BusConnection(open_bus(address, pipeline.filters), str(address)) as port,
+        BusConnection(open_bus(address, pipeline.filters), address) as port,
         Service(port, pipeline, loop_config(), recorder) as live,
         open_bus(address, []) as sender,
     ):

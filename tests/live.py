@@ -178,7 +178,8 @@ def loop_config(**keys: Any) -> RunConfig:
 
 
 def virtual_port(channel: str, filters: Sequence[Any] | None = None) -> BusConnection:
-    return BusConnection(open_bus(BusAddress("virtual", channel), filters), f"virtual {channel}")
+    address = BusAddress("virtual", channel)
+    return BusConnection(open_bus(address, filters), address)
 
 
 def virtual_service(

@@ -9,7 +9,7 @@ from typing import Self
 import can
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.open import BusAddress, backend_capabilities, open_bus
+from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.service.config import PollConfig
 from cangauge.service.pipeline import Pipeline
@@ -88,7 +88,7 @@ def frame(frame_id: int, data: bytes) -> can.Message:
 def polling_service(address: BusAddress, every_s: float = 1.0) -> Service:
     pipeline = Pipeline(Vehicle.load("leaf_ze1_polled"), leaf_model())
     port = BusConnection(
-        open_bus(address, pipeline.filters), str(address), backend_capabilities(address)
+        open_bus(address, pipeline.filters), address
     )
     return Service(port, pipeline, loop_config(poll=PollConfig(every_s=every_s)))
 

@@ -13,7 +13,7 @@ import pytest
 from can.typechecking import CanFilter
 
 from cangauge.bus.connection import AT_ONCE, BusConnection, BusError, error_kinds
-from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, open_bus
+from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from live import BrokenBus, network_down, unpack_error
 
@@ -23,6 +23,7 @@ FILTERS: list[CanFilter] = [
 ]
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="kernel stamps are Linux's")
 FRAME = can.Message(arbitration_id=1, is_extended_id=False)
+NOWHERE = BusAddress("virtual", "x")
 
 
 def multicast(**more: bool) -> BusAddress:
@@ -30,7 +31,7 @@ def multicast(**more: bool) -> BusAddress:
 
 
 def broken(*script: object) -> BusConnection:
-    return BusConnection(BrokenBus(list(script)), "x")  # type: ignore[arg-type] # what is used of it
+    return BusConnection(BrokenBus(list(script)), NOWHERE)  # type: ignore[arg-type] # what is used of it
 
 
 @linux_only
@@ -48,8 +49,9 @@ def test_frames_that_pass_the_filters_are_received(carries_fd: bool) -> None:
         can.Message(arbitration_id=0x123, is_extended_id=True),
         can.Message(arbitration_id=0x124, is_extended_id=False),
     ]
+    address = multicast(fd=carries_fd)
     with (
-        BusConnection(open_bus(multicast(fd=carries_fd), FILTERS), "rx") as port,
+        BusConnection(open_bus(address, FILTERS), address) as port,
         open_bus(multicast()) as sender,
     ):
         before_s = time.time()
@@ -75,7 +77,7 @@ def test_frames_that_pass_the_filters_are_received(carries_fd: bool) -> None:
 
 @linux_only
 def test_many_pending_frames_come_in_batches_in_order() -> None:
-    with BusConnection(open_bus(multicast()), "rx") as port, open_bus(multicast()) as sender:
+    with BusConnection(open_bus(multicast()), multicast()) as port, open_bus(multicast()) as sender:
         for number in range(2 * AT_ONCE + 1):
             sender.send(can.Message(arbitration_id=number, is_extended_id=False))
         parts = [port.receive_pending(5.0) for _ in range(3)]
@@ -91,10 +93,11 @@ def test_many_pending_frames_come_in_batches_in_order() -> None:
 def test_every_frame_is_received_or_counted_as_dropped() -> None:
     sent = 4000
     with (
-        BusConnection(open_bus(multicast()), "receiver") as port,
-        BusConnection(open_bus(multicast()), "sender") as tx,
+        open_bus(multicast()) as receiver,
+        BusConnection(receiver, multicast()) as port,
+        BusConnection(open_bus(multicast()), multicast()) as tx,
     ):
-        with socket.socket(fileno=os.dup(port._bus.fileno())) as own:  # type: ignore[union-attr] # open
+        with socket.socket(fileno=os.dup(receiver.fileno())) as own:
             own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         assert port.queue_drops == 0
         for _ in range(sent):
@@ -107,20 +110,16 @@ def test_every_frame_is_received_or_counted_as_dropped() -> None:
     assert port.queue_drops == dropped  # also when it is closed
 
 
-def test_capabilities_by_interface() -> None:
-    address = BusAddress("virtual", "x")
-    virtual = backend_capabilities(address)
-    assert (virtual.stamps, virtual.echoes) == ("sender", False)
-    with BusConnection(open_bus(address), "virtual") as port:
+def test_stamps_and_echoes_by_interface() -> None:
+    with BusConnection(open_bus(NOWHERE), NOWHERE) as port:
         assert port.queue_drops is None  # it is no socket
-    pcan = backend_capabilities(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))
-    assert (pcan.stamps, pcan.echoes, pcan.has_error_classes) == ("driver", True, False)
-    socketcan = backend_capabilities(BusAddress("socketcan", "can0"))
-    assert (socketcan.stamps, socketcan.echoes) == ("kernel", False)
-    assert socketcan.has_error_classes
-    assert backend_capabilities(multicast()).echoes
+    socketcan = BusAddress("socketcan", "can0")
+    pcan = BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True})
+    buses = (NOWHERE, pcan, socketcan, multicast())
+    assert [bus.echoes for bus in buses] == [False, True, False, True]
+    assert [bus.stamps for bus in buses[:3]] == ["sender", "driver", "kernel"]
     if sys.platform == "linux":
-        assert backend_capabilities(multicast()).stamps == "kernel"
+        assert multicast().stamps == "kernel"
 
 
 def test_frames_read_before_an_error_are_kept() -> None:
@@ -142,10 +141,10 @@ def test_frames_after_an_error_frame_wait_for_the_next_call() -> None:
 
 def test_send_gives_up_when_the_queue_stays_full() -> None:
     full = can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)
-    port = BusConnection(BrokenBus([], sending=full), "x")  # type: ignore[arg-type] # see above
+    port = BusConnection(BrokenBus([], sending=full), NOWHERE)  # type: ignore[arg-type] # see above
     assert not port.send(FRAME, within_s=0.01)
     assert port.unsent == 1
-    down = BusConnection(BrokenBus([], sending=network_down()), "x")  # type: ignore[arg-type] # see above
+    down = BusConnection(BrokenBus([], sending=network_down()), NOWHERE)  # type: ignore[arg-type] # see above
     with pytest.raises(BusError, match=r"sending failed: .*Network is down"):
         down.send(FRAME)
 

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from tornado.websocket import websocket_connect
 
-from cangauge.bus.open import UNKNOWN_INTERFACE
+from cangauge.bus.open import BusAddress
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.extras.live.launch import Live
@@ -34,7 +34,7 @@ BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
 def snapshot() -> Snapshot:
-    port = SimpleNamespace(name="virtual x", capabilities=UNKNOWN_INTERFACE)
+    port = SimpleNamespace(name="virtual x", address=BusAddress("pcan", "x"))
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
     return Monitor(pipeline, port, str(leaf_model_path())).latest  # type: ignore[arg-type] # no bus
 

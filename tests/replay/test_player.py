@@ -38,6 +38,8 @@ from live import (
 )
 from selection import nightly_except
 
+NOWHERE = BusAddress("virtual", "x")
+
 MAX = ReplaySettings(speed=math.inf, acknowledge_s=3.0)
 REPLAYED = PipelineSettings(time_source="replay-clock")
 SOC_FRAMES = [standard_filter(0x5A0), standard_filter(0x5A1)]
@@ -173,7 +175,7 @@ def test_lost_frames_are_counted_and_the_replay_goes_on() -> None:
     bus = LossyBus(open_bus(BusAddress("virtual", "lossy"), SOC_FRAMES), {200, 400, 401, 402})
     source = LogSource(short_log(30.0), Vehicle.load("leaf_aze0"))
     with virtual_service("lossy", REPLAYED, vehicle=Vehicle.load("leaf_aze0")) as service:
-        port = BusConnection(bus, "lossy")  # type: ignore[arg-type] # has what is used of a bus
+        port = BusConnection(bus, NOWHERE)  # type: ignore[arg-type] # has what is used of a bus
         with port:
             state = play(port, source, MAX, stop=never)
         assert service.pipeline.counts.lost > 0
@@ -204,7 +206,7 @@ def test_frames_under_way_are_bounded() -> None:
                     receiver.send(publisher.detail_frame(NOTHING_YET, samples))
 
     thread = threading.Thread(target=receive)
-    with BusConnection(bus, "window") as port:
+    with BusConnection(bus, NOWHERE) as port:
         thread.start()
         source = LogSource(short_log(50.0), Vehicle.load("generic"))
         state = play(port, source, MAX, stop=never)

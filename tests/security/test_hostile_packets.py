@@ -88,8 +88,8 @@ def test_malformed_packets_count_as_garbled(sender: socket.socket) -> None:
     """By both ways of reading, filtered, before and after a good frame with the same id."""
     wanted = [standard_filter(ID)]
     with (
-        BusConnection(open_bus(ADDRESS, wanted), "one by one") as single,
-        BusConnection(open_bus(ADDRESS, wanted), "pending") as pending,
+        BusConnection(open_bus(ADDRESS, wanted), ADDRESS) as single,
+        BusConnection(open_bus(ADDRESS, wanted), ADDRESS) as pending,
     ):
         for hostile in HOSTILE:
             send(sender, hostile, packet(), hostile)
@@ -100,7 +100,7 @@ def test_malformed_packets_count_as_garbled(sender: socket.socket) -> None:
 
 
 def test_a_channel_of_one_word_is_kept(sender: socket.socket) -> None:
-    with BusConnection(open_bus(ADDRESS), "rx") as port:
+    with BusConnection(open_bus(ADDRESS), ADDRESS) as port:
         for channel in (None, 0, "can0", "Größe-1"):
             send(sender, packet({"channel": channel}))
             assert [each.channel for each in port.receive_pending(1.0)] == [channel]
@@ -115,9 +115,9 @@ def test_the_default_bus_drops_what_other_machines_send(
     assert not ADDRESS.local_only
     local = BusAddress("udp_multicast", GROUP, {"port": PORT, "hop_limit": 0}, local_only=True)
     with (
-        BusConnection(open_bus(local), "one by one") as single,
-        BusConnection(open_bus(local), "pending") as pending,
-        BusConnection(open_bus(ADDRESS), "named") as named,
+        BusConnection(open_bus(local), local) as single,
+        BusConnection(open_bus(local), local) as pending,
+        BusConnection(open_bus(ADDRESS), ADDRESS) as named,
     ):
         send(sender, packet())
         assert single.receive(1.0) is not None

@@ -10,7 +10,7 @@ from typing import Any
 import can
 import pytest
 
-from cangauge.bus.open import UNKNOWN_INTERFACE
+from cangauge.bus.open import BusAddress
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
@@ -37,7 +37,7 @@ class SimulatedPort:
         Frames and when they arrive [s since the beginning].
     """
 
-    capabilities = UNKNOWN_INTERFACE
+    address = BusAddress("pcan", "x")
     queue_drops = None
     name = "simulated"
 

@@ -11,7 +11,7 @@ import pytest
 from simulated import EPOCH_S, GIVEN, SimulatedPort, frames_every, simulate
 
 from cangauge.bus.connection import BusConnection, BusError
-from cangauge.bus.open import BackendCapabilities, Stamps
+from cangauge.bus.open import BusAddress
 from cangauge.bus.publish import SocDetail, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
@@ -110,11 +110,11 @@ def test_soc_is_unknown_then_old_then_fresh_again() -> None:
     assert port.published[-1][1].status is Status.DEGRADED  # its delay line is still filling
 
 
-@pytest.mark.parametrize("stamps", ["kernel", "driver"])
-def test_backlog_is_stale_until_it_is_processed(stamps: Stamps) -> None:
+@pytest.mark.parametrize("interface", ["socketcan", "pcan"])
+def test_backlog_is_stale_until_it_is_processed(interface: str) -> None:
     """The service is suspended from 3.0 to 9.0 s, then reads the backlog within two seconds."""
     port = SimulatedPort(frames_every(0.02, 14.0))
-    port.capabilities = BackendCapabilities(stamps, echoes=False, has_error_classes=False)
+    port.address = BusAddress(interface, "can0")
     port.suspended_s = (3.0, 6.0)
     # The backlog is six seconds of fifty samples of two frames, plus what arrives meanwhile.
     port.work_s = lambda since_s: 0.0025 if 9.0 <= since_s < 11.0 else 0.0
@@ -123,7 +123,7 @@ def test_backlog_is_stale_until_it_is_processed(stamps: Stamps) -> None:
     assert not any(each.reasons & Reason.INPUT_STALE for each in fresh)
     behind = [content for at_s, content in port.published if 9.0 < at_s < 9.9]
     assert len(behind) >= 9
-    if stamps == "kernel":
+    if interface == "socketcan":
         assert {each.status for each in behind} == {Status.INVALID}
         assert all(each.reasons & Reason.INPUT_STALE for each in behind)
         assert behind[0].age_s == 6.0  # falls by three seconds a second
@@ -136,7 +136,7 @@ def test_a_process_stopped_for_ten_minutes_knows_what_it_missed() -> None:
     """It is stopped at 3 s; the kernel's queue holds one second, and is full for the rest."""
     frames = [*frames_every(0.02, 4.0), *frames_every(0.02, 620.0, from_s=603.1)]
     port = SimulatedPort(frames)
-    port.capabilities = BackendCapabilities("kernel", echoes=False, has_error_classes=False)
+    port.address = BusAddress("socketcan", "can0")
     port.suspended_s = (3.0, 600.0)
     port.work_s = lambda since_s: 0.005 if since_s < 603.5 else 0.0
     simulate(port, 620.0)

@@ -12,7 +12,7 @@ from random import Random
 import pytest
 from simulated import EPOCH_S, GIVEN, SimulatedPort, frames_every, simulate
 
-from cangauge.bus.open import BackendCapabilities
+from cangauge.bus.open import BusAddress
 from cangauge.bus.publish import SocEstimate
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames
@@ -25,7 +25,7 @@ from cangauge.types import Reason, Sample, Status
 from live import LoggedLines, Rows, frames_of, leaf_model, loop_config, short_log
 
 GENERIC = Vehicle.load("generic")
-KERNEL = BackendCapabilities("kernel", echoes=False, has_error_classes=False)
+KERNEL = BusAddress("socketcan", "can0")
 
 
 def run(
@@ -37,7 +37,7 @@ def run(
     recording gives the same numbers.
     """
     port = SimulatedPort(frames_every(0.02, seconds, stamp=stamp))
-    port.capabilities = KERNEL
+    port.address = KERNEL
     pipeline, rows = Pipeline(GENERIC, leaf_model(), GIVEN), Rows([])
     with Recorder(path) as recorder, LoggedLines("cangauge.service.loop") as logged:
         simulate(port, seconds, pipeline, outputs=[rows, recorder])

@@ -49,7 +49,7 @@ def test_killed_started_again_and_stopped(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     wanted = [standard_filter(0x5A0)]
     address = BusAddress("udp_multicast", ADDRESS, {"port": PORT})
-    with BusConnection(open_bus(address, wanted), "bus") as port:
+    with BusConnection(open_bus(address, wanted), address) as port:
         # Killed: what was written by then is there.
         service = run(path)
         drive(port, 0, 200)

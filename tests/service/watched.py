@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities
+from cangauge.bus.open import BusAddress
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -23,7 +23,7 @@ class StandInPort:
     unsent: int = 3
     queue_drops: int | None = 4
     is_off: bool = False
-    capabilities: BackendCapabilities = UNKNOWN_INTERFACE
+    address: BusAddress = field(default_factory=lambda: BusAddress("pcan", "x"))
 
 
 @dataclass

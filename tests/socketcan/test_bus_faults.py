@@ -286,8 +286,8 @@ def test_two_thousand_error_frames_cost_no_sample() -> None:
 
 def test_the_kernel_stamps_frames_on_arrival() -> None:
     with (
-        BusConnection(open_bus(VCAN), "receiver") as port,
-        BusConnection(open_bus(VCAN), "sender") as sender,
+        BusConnection(open_bus(VCAN), VCAN) as port,
+        BusConnection(open_bus(VCAN), VCAN) as sender,
     ):
         before_s = time.time()
         sender.send(can.Message(arbitration_id=0x123, is_extended_id=False))
@@ -369,8 +369,8 @@ def _overflow() -> int:
     encoder, sent = FrameEncoder(Vehicle.load("generic")), 0
     frames = [frame for each in samples_of(short_log(200.0)) for frame in encoder.encode(each)]
     with (
-        BusConnection(open_bus(VCAN), "witness") as witness,
-        BusConnection(open_bus(VCAN, []), "tx") as sender,
+        BusConnection(open_bus(VCAN), VCAN) as witness,
+        BusConnection(open_bus(VCAN, []), VCAN) as sender,
     ):
         while not witness.queue_drops:
             for frame in frames:

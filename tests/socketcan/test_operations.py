@@ -43,8 +43,8 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     encoder = FrameEncoder(Vehicle.load("generic"))
     frames = [encoder.encode(sample) for sample in samples_of(short_log(50.0))]
     with (
-        BusConnection(open_bus(VCAN, pipeline.filters), "vcan0") as port,
-        BusConnection(open_bus(VCAN, []), "sender") as sender,
+        BusConnection(open_bus(VCAN, pipeline.filters), VCAN) as port,
+        BusConnection(open_bus(VCAN, []), VCAN) as sender,
         Recorder(tmp_path / "seen.log", part_bytes=5_000) as recorder,
     ):
         monitor = Monitor(pipeline, port, recorder=recorder)

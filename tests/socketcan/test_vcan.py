@@ -55,14 +55,14 @@ def _vcan0() -> None:
 
 @pytest.fixture
 def replay_port() -> Iterator[BusConnection]:
-    with BusConnection(open_bus(VCAN, SOC_FRAMES), str(VCAN)) as port:
+    with BusConnection(open_bus(VCAN, SOC_FRAMES), VCAN) as port:
         yield port
 
 
 def service(preset: str, settings: PipelineSettings, record: Recorder | None = None) -> Service:
     pipeline = Pipeline(Vehicle.load(preset), leaf_model(), settings)
     return Service(
-        BusConnection(open_bus(VCAN, pipeline.filters), str(VCAN)), pipeline, loop_config(), record
+        BusConnection(open_bus(VCAN, pipeline.filters), VCAN), pipeline, loop_config(), record
     )
 
 
@@ -98,7 +98,7 @@ def test_received_frames_equal_those_of_python_can(
         expected = []
         while (message := theirs.recv(0.5)) is not None:
             expected.append(message)
-        port, found = BusConnection(ours, "ours"), []
+        port, found = BusConnection(ours, VCAN), []
         while frames := port.receive_pending(0.2) or port.receive_pending(0.0):
             found += frames
     # The kernel's filters drop two of the sent frames, and no error frame.

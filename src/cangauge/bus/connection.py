@@ -23,7 +23,7 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.typechecking import CanFilter
 
-from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities
+from cangauge.bus.open import BusAddress
 from cangauge.errors import CangaugeError
 
 SEND_WITHIN_S: Final = 1.0
@@ -103,9 +103,7 @@ class BusConnection:
     ----------
     bus : can.BusABC, optional
         None: no bus at present.
-    name : str
-        For messages.
-    capabilities : BackendCapabilities, optional
+    address : BusAddress
 
     Attributes
     ----------
@@ -119,14 +117,9 @@ class BusConnection:
         queue was empty after the latest call that received.
     """
 
-    def __init__(
-        self,
-        bus: can.BusABC | None,
-        name: str,
-        capabilities: BackendCapabilities = UNKNOWN_INTERFACE,
-    ) -> None:
-        self.name = name
-        self.capabilities = capabilities
+    def __init__(self, bus: can.BusABC | None, address: BusAddress) -> None:
+        self.address = address
+        self.name = str(address)
         self.garbled = self.error_frames = self.unsent = 0
         self.error_kinds: Counter[str] = Counter()
         self.is_off = self.is_drained = False
@@ -269,7 +262,7 @@ class BusConnection:
 
     def _count_error(self, message: can.Message) -> None:
         self.error_frames += 1
-        has_classes = self.capabilities.has_error_classes
+        has_classes = self.address.interface == "socketcan"
         kinds = error_kinds(message) if has_classes else ["unspecified"]
         self.error_kinds.update(kinds)
         self.is_off = "bus_off" in kinds or (self.is_off and "restarted" not in kinds)

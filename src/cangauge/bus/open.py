@@ -31,6 +31,7 @@ except ImportError:  # in a light install; then there is no UDP bus either
     msgpack = None
 
 BusOption = str | int | float | bool
+Stamps = Literal["kernel", "sender", "driver"]
 
 MULTICAST_CHANNEL: Final = "239.74.163.2"
 """IPv4 group of python-can; its default is an IPv6 group, which some machines cannot reach."""
@@ -83,6 +84,27 @@ class BusAddress:
 
     def __str__(self) -> str:
         return f"{self.interface} {self.channel}"
+
+    @property
+    def echoes(self) -> bool:
+        """Whether own frames are received too."""
+        always = self.interface == "udp_multicast"
+        return always or bool(self.options.get("receive_own_messages", False))
+
+    @property
+    def stamps(self) -> Stamps:
+        """Origin of the time stamps.
+
+        "kernel": arrival, however late the frame is read (SO_TIMESTAMPNS). "sender": sending,
+        within one process. "driver": by the adapter's clock, or when the frame is read.
+        """
+        if self.interface == "virtual":
+            return "sender"
+        # On systems other than Linux, python-can stamps UDP packets when it reads them.
+        has_kernel_stamps = self.interface == "socketcan" or (
+            self.interface == "udp_multicast" and sys.platform == "linux"
+        )
+        return "kernel" if has_kernel_stamps else "driver"
 
 
 def bus_address(
@@ -254,40 +276,6 @@ def _cure_of_missing(channel: str) -> str:
     with suppress(OSError):
         names = [name for _, name in socket.if_nameindex() if "can" in name]
     return f"check adapter and name; this machine has {', '.join(names) or 'no CAN interface'}"
-
-
-# --- Capabilities
-
-Stamps = Literal["kernel", "sender", "driver"]
-
-
-@dataclass(frozen=True)
-class BackendCapabilities:
-    """Properties of an interface.
-
-    `stamps` is the origin of the time stamps. "kernel": arrival, however late the frame is read
-    (SO_TIMESTAMPNS). "sender": sending (within one process). "driver": depends on the driver, the
-    adapter's clock or the moment of reading. `echoes`: own frames are received too.
-    `has_error_classes`: error frames have SocketCAN's error classes.
-    """
-
-    stamps: Stamps
-    echoes: bool
-    has_error_classes: bool
-
-
-UNKNOWN_INTERFACE: Final = BackendCapabilities("driver", echoes=False, has_error_classes=False)
-
-
-def backend_capabilities(address: BusAddress) -> BackendCapabilities:
-    """Return the capabilities of the interface of an address."""
-    is_udp = address.interface == "udp_multicast"
-    echoes = is_udp or bool(address.options.get("receive_own_messages", False))
-    stamps: Stamps = "sender" if address.interface == "virtual" else "driver"
-    # On systems other than Linux, python-can stamps UDP packets when it reads them.
-    if address.interface == "socketcan" or (is_udp and sys.platform == "linux"):
-        stamps = "kernel"
-    return BackendCapabilities(stamps, echoes, address.interface == "socketcan")
 
 
 # --- UDP multicast. Anybody who reaches the port may send: the socket is bound to all network

@@ -13,7 +13,7 @@ from can.typechecking import CanFilter
 
 from cangauge._logging import emit
 from cangauge.bus.connection import AT_ONCE, SEND_WITHIN_S, BusConnection, BusError
-from cangauge.bus.open import BusAddress, DriverMissingError, backend_capabilities, open_bus
+from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.errors import InputError
 
 _LOG = logging.getLogger(__name__)
@@ -43,9 +43,9 @@ class ReconnectingBus(BusConnection):
     def __init__(
         self, address: BusAddress, filters: Sequence[CanFilter], opener: Opener = open_bus
     ) -> None:
-        super().__init__(None, str(address), backend_capabilities(address))
+        super().__init__(None, address)
         self.losses = 0
-        self._address, self._filters, self._opener = address, list(filters), opener
+        self._filters, self._opener = list(filters), opener
         self._since_s = time.monotonic()
         self._away_s = self._retry_at_s = 0.0
         self._pause_s = FIRST_PAUSE_S
@@ -57,7 +57,7 @@ class ReconnectingBus(BusConnection):
         Raises InputError as `open_bus`; with `wait` only for a missing driver.
         """
         try:
-            self._bus = self._opener(self._address, self._filters)
+            self._bus = self._opener(self.address, self._filters)
         except InputError as error:
             if not wait or isinstance(error, DriverMissingError):
                 raise
@@ -126,7 +126,7 @@ class ReconnectingBus(BusConnection):
         if self.is_off != self._was_off:
             self._was_off = self.is_off
             if self.is_off:
-                cure = f"ip link set {self._address.channel} type can restart-ms 100"
+                cure = f"ip link set {self.address.channel} type can restart-ms 100"
                 text = "the controller is bus-off until the kernel restarts it"
                 self._log("bus.off", logging.WARNING, f"{text} (automatically: {cure})")
             else:
@@ -157,7 +157,7 @@ class ReconnectingBus(BusConnection):
             time.sleep(min(left_s, timeout_s))
             return
         try:
-            bus = self._opener(self._address, self._filters)
+            bus = self._opener(self.address, self._filters)
         except Exception as error:  # noqa: BLE001 - drivers raise anything
             self._schedule_attempt()
             away_s = time.monotonic() - self._since_s

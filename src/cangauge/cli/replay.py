@@ -110,7 +110,7 @@ def replay_command(
     with ExitStack() as stack:
         stack.enter_context(stop_on_signals(partial(stopped.append, True)))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
-        bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
+        bus = stack.enter_context(BusConnection(open_bus(address, filters), address))
         note(f"playing {recorded} on {address}, speed {speed}")
         show_line = stack.enter_context(progress())
 

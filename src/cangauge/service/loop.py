@@ -82,9 +82,9 @@ class Loop:
         self._sort_outputs()
         self._monitor = monitor or Monitor(pipeline, port)
         self._checkpoint, self._reload = checkpoint, reload
-        self._own = OwnFrames(echoes=port.capabilities.echoes)
-        self._asked = OwnFrames(echoes=port.capabilities.echoes)
-        self._stamps_are_arrival = port.capabilities.stamps != "driver"
+        self._own = OwnFrames(echoes=port.address.echoes)
+        self._asked = OwnFrames(echoes=port.address.echoes)
+        self._stamps_are_arrival = port.address.stamps != "driver"
         self._stamps = StampLimiter(DRIVER_TOLERANCE_S)
         if self._stamps_are_arrival:
             self._stamps = StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())

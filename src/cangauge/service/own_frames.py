@@ -29,7 +29,7 @@ class OwnFrames:
     Parameters
     ----------
     echoes : bool
-        Whether the bus returns own frames (see `BackendCapabilities`).
+        Whether the bus returns own frames (see `BusAddress`).
 
     Attributes
     ----------

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Final, Self
 
-from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, is_multicast
+from cangauge.bus.open import BusAddress, bus_address, is_multicast
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.settings import EstimatorSettings
@@ -133,7 +133,7 @@ def _check_publish(config: RunConfig) -> None:
         raise InputError(
             problem, source=config.file, field="publish.channel", value=channel, cure=cure
         )
-    if any(backend_capabilities(bus).echoes for bus in buses):
+    if any(bus.echoes for bus in buses):
         problem = "a bus returns the frames sent on it: they would go round for ever"
         cure = "use SocketCAN on both buses, and remove receive_own_messages"
         raise InputError(

@@ -242,7 +242,7 @@ class Monitor:
                 "lost": pipeline.counts.lost,
             },
             "rejects": rejects,
-            "stamps": port.capabilities.stamps,
+            "stamps": port.address.stamps,
             "bus_up": not any(getattr(port, name, False) for name in ("is_away", "is_off")),
             "bus_counts": {name: n for name, n in counts.items() if n is not None},
             "bus_trouble": getattr(port, "trouble", "") or None,

@@ -157,7 +157,7 @@ def _listen(bus: Mapping[str, Any], seconds: float, path: Path) -> Path:
     address = bus_address(bus["interface"], bus["channel"], bus["bus_options"])
     frames = 0
     with (
-        BusConnection(open_bus(address), str(address)) as port,
+        BusConnection(open_bus(address), address) as port,
         can.CanutilsLogWriter(path) as writer,
         progress() as show,
     ):

@@ -201,7 +201,7 @@ def run_suite(
     scores = []
     with (
         tempfile.TemporaryDirectory(prefix="cangauge-suite-") as folder,
-        BusConnection(open_bus(address), str(address)) as bus,
+        BusConnection(open_bus(address), address) as bus,
     ):
         gauge = _Gauge(bus, address, Path(folder), command)
         for number, fault in enumerate(faults, start=1):
