@@ -44,7 +44,7 @@ from rich.table import Table
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress, bus_address, open_bus
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import Pacer
@@ -123,14 +123,14 @@ def _latencies(address: BusAddress, seconds: float) -> list[float]:
 
 
 def _send_samples(address: BusAddress, seconds: float) -> None:
-    encoder, clock = FrameEncoder(Vehicle.load("generic")), ClockFrames()
+    encoder = FrameEncoder(Vehicle.load("generic"))
     bus, pacer = open_bus(address), Pacer(1.0, lambda: False)
     for number in range(int(seconds * SAMPLE_HZ)):
         time_us = number * 1_000_000 // SAMPLE_HZ
         time_s = time_us / 1e6
         frames = encoder.encode(Sample(time_s, 20.0 + 10.0 * math.sin(time_s), 380.0, 25.0))
         pacer.wait(time_us)
-        bus.send(clock.at(time_us))
+        bus.send(clock_frame(time_us))
         for frame in frames:
             bus.send(frame)
     time.sleep(0.2)

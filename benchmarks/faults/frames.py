@@ -17,7 +17,7 @@ import can
 from cangauge._resources import shared_file
 from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.recording import read_log
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.replay.encoder import FrameEncoder
@@ -507,13 +507,13 @@ def clock_steps(seconds: float) -> FrameChange:
     """Shift the replay clock permanently."""
 
     def whole(found: list[Event], profile: Profile, _v: Vehicle, _r: object) -> list[Event]:
-        clock, first = ClockFrames(), profile.fault_s[0]
+        first = profile.fault_s[0]
         out, last_s = [], -1.0
         for event in found:
             if event.at_s >= first and event.at_s != last_s:
                 # It follows the true clock and overrides it.
                 last_s = event.at_s
-                out.append(Event(event.at_s, clock.at(round((event.at_s + seconds) * 1e6))))
+                out.append(Event(event.at_s, clock_frame(round((event.at_s + seconds) * 1e6))))
             out.append(event)
         return out
 
@@ -524,11 +524,11 @@ def clock_damaged() -> FrameChange:
     """Add a clock to every sample that is an hour off and has a wrong CRC."""
 
     def whole(found: list[Event], profile: Profile, _v: Vehicle, _r: object) -> list[Event]:
-        clock, (first, last) = ClockFrames(), profile.fault_s
+        first, last = profile.fault_s
         out = []
         for event in found:
             if first <= event.at_s < last and "current" in event.roles:
-                wrong = clock.at(round((event.at_s + 3600) * 1e6))
+                wrong = clock_frame(round((event.at_s + 3600) * 1e6))
                 data = bytearray(wrong.data)
                 data[7] ^= 0xFF
                 out.append(Event(event.at_s, altered(wrong, data=bytes(data))))

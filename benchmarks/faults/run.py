@@ -18,7 +18,7 @@ import can
 import cantools
 
 from cangauge._resources import shared_file
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
 from cangauge.replay.player import Pacer
@@ -129,7 +129,7 @@ class _FramePlayer:
         self._sender = sender
         self._observation = observed
         self._speed = speed
-        self._clock = None if speed == 1.0 else ClockFrames()
+        self._sends_clock = speed != 1.0
         self._pacer = Pacer(speed, lambda: False)
         observed.good_sent_s = {role: [] for role in ROLES}
 
@@ -144,8 +144,8 @@ class _FramePlayer:
         for event in found:
             if event.at_s != last_s:
                 self._pacer.wait(round(event.at_s * 1e6))
-                if self._clock is not None:
-                    send(self._clock.at(round(event.at_s * 1e6)))
+                if self._sends_clock:
+                    send(clock_frame(round(event.at_s * 1e6)))
                 last_s = event.at_s
                 observed.sent_s.append(time.monotonic())
                 observed.bus_s.append(event.at_s)

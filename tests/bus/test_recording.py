@@ -12,7 +12,7 @@ import pytest
 
 from cangauge.bus.readers import PAUSE_S
 from cangauge.bus.recording import capture_samples, capture_to_log, open_recording, read_log
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
@@ -130,9 +130,9 @@ def test_a_recorded_drive_becomes_a_log(tmp_path: Path, generic: Vehicle) -> Non
 
 
 def test_the_replay_clock_gives_the_logs_own_time(tmp_path: Path, generic: Vehicle) -> None:
-    clock, frames = ClockFrames(), []
+    frames = []
     for frame in drive(generic, start_s=-10.0):
-        tick = clock.at(round(frame.timestamp * 1e6))
+        tick = clock_frame(round(frame.timestamp * 1e6))
         frame.timestamp = 5000.0 + frame.timestamp / 10.0  # replayed ten times faster
         tick.timestamp, tick.channel = frame.timestamp, "can0"
         frames += [tick, frame]

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.time_source import KERNEL_TOLERANCE_S, StampLimiter
+from cangauge.bus.time_source import TOLERANCE_S, StampLimiter
 
 OFFSET_S = 1.7e9
 """Stamps minus monotonic time of an honest clock [s]."""
@@ -31,7 +31,7 @@ def limited(
     hold: Callable[[float], float] = lambda arrival_s: arrival_s,
 ) -> tuple[list[tuple[float, float]], StampLimiter]:
     """Return (arrival, bus time less the offset) of a frame every 10 ms, read when `hold` ends."""
-    limiter = limiter or StampLimiter(KERNEL_TOLERANCE_S, OFFSET_S)
+    limiter = limiter or StampLimiter(TOLERANCE_S["kernel"], OFFSET_S)
     rng, out = Random(1), []  # noqa: S311 - must be repeatable
     waiting: list[tuple[float, can.Message]] = []
     since_s = 100.0
@@ -82,7 +82,7 @@ BROKEN: dict[str, Stamp] = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_unusable_stamps_become_the_time_of_receiving(name: str) -> None:
     found, limiter = limited(BROKEN[name])
-    assert max(errors(found)) <= KERNEL_TOLERANCE_S + STEP_S + READING_S
+    assert max(errors(found)) <= TOLERANCE_S["kernel"] + STEP_S + READING_S
     times = [bus_s for _, bus_s in found]
     assert times[-1] - times[0] == pytest.approx(29.98, abs=0.05)
     assert limiter.is_uncertain(100.0 + 30.0)
@@ -112,7 +112,7 @@ def test_adapter_with_its_own_drifting_clock_is_followed() -> None:
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40))
 def test_any_stamps_give_times_that_are_possible(stamps: list[float]) -> None:
-    limiter = StampLimiter(KERNEL_TOLERANCE_S, OFFSET_S)
+    limiter = StampLimiter(TOLERANCE_S["kernel"], OFFSET_S)
     for number, stamp_s in enumerate(stamps):
         message = can.Message(timestamp=stamp_s)
         came_s = limiter.limit([message], 100.0 + number, 101.0 + number)

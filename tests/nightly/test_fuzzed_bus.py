@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
-from cangauge.bus.time_source import ClockFrames, StampLimiter
+from cangauge.bus.time_source import StampLimiter, clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.published import leaf_2012_model_file
@@ -116,10 +116,10 @@ def model() -> object:
 
 
 def good_frames(vehicle: Vehicle) -> list[can.Message]:
-    encoder, clock = FrameEncoder(vehicle), ClockFrames()
+    encoder = FrameEncoder(vehicle)
     frames: list[can.Message] = []
     for time_s, current_a, voltage_v, temperature_c, soc_pct in log_rows():
-        frames.append(clock.at(round(time_s * 1e6)))
+        frames.append(clock_frame(round(time_s * 1e6)))
         frames += encoder.encode(Sample(time_s, current_a, voltage_v, temperature_c), soc_pct)
     return frames
 

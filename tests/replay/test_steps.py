@@ -11,7 +11,7 @@ import pytest
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.publish import SocPublisher
 from cangauge.bus.recording import capture_samples
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.replay.steps import CaptureSource, LogSource
@@ -71,10 +71,10 @@ def test_a_captures_frames_are_sent_unchanged(tmp_path: Path) -> None:
 def test_own_frames_of_a_capture_only_give_its_time(
     tmp_path: Path,
 ) -> None:
-    publisher, clock = SocPublisher(), ClockFrames()
+    publisher = SocPublisher()
     frames = []
     for number in range(5):
-        mark = clock.at(1_000_000 * number)
+        mark = clock_frame(1_000_000 * number)
         published = publisher.estimate_frame(NOTHING_YET)
         for each in (mark, frame(0.0, data=bytes([number])), published):
             each.timestamp = 1.7e9 + 1e-3 * len(frames)
@@ -87,10 +87,9 @@ def test_own_frames_of_a_capture_only_give_its_time(
 
 
 def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
-    clock = ClockFrames()
     frames = []
     for time_us in (0, 50_000_000, 0, 50_000_000):
-        frames += [clock.at(time_us), frame(0.0)]
+        frames += [clock_frame(time_us), frame(0.0)]
     for number, each in enumerate(frames):
         each.timestamp = 1.7e9 + number
     with pytest.raises(InputError, match="several consecutive replays"):

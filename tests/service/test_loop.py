@@ -13,7 +13,7 @@ from simulated import EPOCH_S, GIVEN, SimulatedPort, frames_every, simulate
 from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.open import BusAddress
 from cangauge.bus.publish import SocDetail, SocReader
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -183,7 +183,7 @@ def test_a_failing_output_and_an_idle_replay_clock_are_told_once(
     pipeline, failing, rows = Pipeline(GENERIC, leaf_model()), Failing(), Rows([])
     with virtual_port("fails", pipeline.filters) as port, virtual_port("fails") as sender:
         loop = Loop(port, pipeline, loop_config(), outputs=[failing, rows])
-        for frame in [*[ClockFrames().at(5_000_000)] * 3, *frames_of(short_log(2.0))]:
+        for frame in [*[clock_frame(5_000_000)] * 3, *frames_of(short_log(2.0))]:
             sender.send(frame)
         loop.run(lambda: pipeline.samples == 20)
     # It is called no more, and the others are.

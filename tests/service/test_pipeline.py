@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.publish import ACKNOWLEDGE_EVERY, SocDetail, SocReader
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
@@ -28,10 +28,9 @@ def log() -> Log:
 
 def with_clock(frames: list[can.Message]) -> list[can.Message]:
     """Return the frames as `replay` sends them: after their clock, with arbitrary stamps."""
-    clock = ClockFrames()
     sent = []
     for frame in frames:
-        sent += [clock.at(round(frame.timestamp * 1e6)), frame]
+        sent += [clock_frame(round(frame.timestamp * 1e6)), frame]
         frame.timestamp = 7.0
     return sent
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.captures import all_parts, open_capture, parts_of_run
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.service import record
@@ -114,9 +114,9 @@ def test_a_recording_gives_the_live_numbers(
 
 def test_a_recorded_replay_uses_the_logs_time(tmp_path: Path) -> None:
     """Of two replays in a row each log is estimated separately."""
-    clock, messages = ClockFrames(), list[can.Message]()
+    messages = list[can.Message]()
     for frame in frames_of(short_log(30.0)) * 2:
-        messages += [clock.at(round(frame.timestamp * 1e6)), copy.copy(frame)]
+        messages += [clock_frame(round(frame.timestamp * 1e6)), copy.copy(frame)]
     for number, message in enumerate(messages):
         message.timestamp = 1.7e9 + 1e-4 * number
     settings = PipelineSettings(time_source="replay-clock")

@@ -15,7 +15,7 @@ from simulated import EPOCH_S, GIVEN, SimulatedPort, frames_every, simulate
 from cangauge.bus.open import BusAddress
 from cangauge.bus.publish import SocEstimate
 from cangauge.bus.recording import capture_samples
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.offline import estimate_capture
@@ -89,11 +89,10 @@ def test_clock_set_in_mid_drive_costs_nothing(tmp_path: Path) -> None:
 
 
 def test_samples_that_are_refused_do_not_make_it_fresh() -> None:
-    clock = ClockFrames()
     frames = [  # a replay whose clock stands still after a second
         (at_s, message)
         for at_s, frame in frames_every(0.05, 4.0)
-        for message in (clock.at(min(round(at_s * 1e6), 1_000_000)), frame)
+        for message in (clock_frame(min(round(at_s * 1e6), 1_000_000)), frame)
     ]
     pipeline = Pipeline(GENERIC, leaf_model(), replace(GIVEN, time_source="replay-clock"))
     settings = loop_config(timeout_s=0.3, duration_s=4.0)

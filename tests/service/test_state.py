@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import pytest
 
-from cangauge.bus.time_source import ClockFrames
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
@@ -179,11 +179,10 @@ def test_a_state_of_another_release_gives_its_soc(machine: Machine) -> None:
 
 def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) -> None:
     machine.settings = replace(machine.settings, time_source="replay-clock")
-    clock = ClockFrames()
 
     def play(service: Machine, samples: list[Sample]) -> Estimate:
         for sample in samples:
-            service.pipeline.handle(clock.at(round((sample.time_s - EPOCH_S) * 1e6)))
+            service.pipeline.handle(clock_frame(round((sample.time_s - EPOCH_S) * 1e6)))
             for frame in service.encoder.encode(sample):
                 service.pipeline.handle(frame)
         return service.pipeline.latest

@@ -9,17 +9,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cangauge._resources import shared_file
+from cangauge.bus.database import load_dbc
 from cangauge.bus.time_source import (
     COUNT_EVERY,
-    ClockFrames,
     ReceiveTime,
     ReplayClock,
+    clock_frame,
+    count_frame,
     is_clock,
     time_source,
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from live import leaf_model
+
+DBC = load_dbc(shared_file("dbc", "soc_estimate.dbc"))
 
 
 def frame(time_s: float = 0.0, frame_id: int = 0x401) -> can.Message:
@@ -53,46 +58,50 @@ def test_receive_stamps_as_bus_time(stamps: list[float], times: list[float]) -> 
 @given(st.integers(-(1 << 52), 1 << 52))
 def test_the_replay_clock_carries_any_time_exactly(time_us: int) -> None:
     clock = ReplayClock()
-    assert clock.time_of(ClockFrames().at(time_us)) is None
+    message = clock_frame(time_us)
+    assert clock.time_of(message) is None
     assert clock.time_of(frame()) == time_us / 1e6
+    assert DBC.decode_message("REPLAY_CLOCK", message.data)["log_time_us"] == time_us
 
 
 def test_a_damaged_clock_frame_is_refused() -> None:
-    clock, frames = ReplayClock(), ClockFrames()
+    clock = ReplayClock()
     assert clock.time_of(frame(3.0)) is None  # before the first clock
-    clock.time_of(frames.at(1_000_000))
-    broken = frames.at(9_000_000)
+    clock.time_of(clock_frame(1_000_000))
+    broken = clock_frame(9_000_000)
     broken.data[0] ^= 1
     clock.time_of(broken)
     assert (clock.time_of(frame()), clock.refused) == (1.0, 1)
 
 
 def test_the_replay_clock_jumping_back_is_a_new_log() -> None:
-    clock, frames = ReplayClock(), ClockFrames()
+    clock = ReplayClock()
     for time_us in (0, 100_000_000, 99_500_000):
-        clock.time_of(frames.at(time_us))
+        clock.time_of(clock_frame(time_us))
     assert clock.beginnings == 0
-    clock.time_of(frames.at(0))
+    clock.time_of(clock_frame(0))
     assert clock.beginnings == 1
 
 
 def test_an_extended_frame_with_the_clocks_number_is_no_clock() -> None:
     clock = time_source("replay-clock", 0x123)
-    message = ClockFrames(0x123).at(5)
+    message = clock_frame(5, 0x123)
     message.is_extended_id = True
     clock.time_of(message)
     assert clock.time_of(frame()) is None
-    assert clock.time_of(ClockFrames(0x123).at(7)) is None
+    assert clock.time_of(clock_frame(7, 0x123)) is None
     assert clock.time_of(frame()) == pytest.approx(7e-6)
 
 
 def replayed(times: int) -> list[can.Message]:
     """Return the frames of a replay's clock: a count at the start, after each 64, and the end."""
-    clock, frames = ClockFrames(), []
+    frames = []
     for sent in range(times):
-        frames += [clock.count(sent)] if sent % COUNT_EVERY == 0 else []
-        frames.append(clock.at(100_000 * sent))
-    return [*frames, clock.count(times)]
+        frames += [count_frame(sent)] if sent % COUNT_EVERY == 0 else []
+        frames.append(clock_frame(100_000 * sent))
+    last = count_frame(times)
+    assert DBC.decode_message("REPLAY_COUNT", last.data)["clocks_sent"] == times
+    return [*frames, last]
 
 
 @pytest.mark.parametrize("lost", [0, 1, 16, 160, 480])

@@ -7,14 +7,16 @@ samples lack.
 from __future__ import annotations
 
 from array import array
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sized
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+import can
 import numpy as np
+from can.typechecking import Channel
 
 from cangauge._files import as_path
 from cangauge._typing import FloatArray
@@ -29,7 +31,7 @@ from cangauge.bus.captures import (
 )
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder, unsigned_reading
 from cangauge.bus.readers import PAUSE_S
-from cangauge.bus.time_source import RecordedTime, TimeSource, time_source
+from cangauge.bus.time_source import ReplayClock, frames_of_buses, time_source
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.errors import InputError, require_temperature
 from cangauge.logs.column_map import ColumnMap
@@ -259,38 +261,27 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     that of REPLAY_CLOCK if the capture holds one, else the recorded stamps. Raises InputError if
     the capture cannot be read, or gives no sample.
     """
-    capture, recorded = open_vehicle_capture(path, vehicle), RecordedTime()
-    # Of each bus: its time (stamps of two buses can be of two adapters), decoder, and values.
-    buses: dict[Any, tuple[TimeSource, SampleDecoder, array[float]]] = {}
-    sessions: defaultdict[Any, list[int]] = defaultdict(list)
-    for message in capture:
-        if recorded.begins_replay(message):
-            buses.clear()
-            sessions.clear()
-        if message.channel not in buses:
-            own = time_source(recorded.name)
-            buses[message.channel] = own, SampleDecoder(vehicle), array("d")
-        own, decoder, values = buses[message.channel]
-        if (now_s := own.time_of(message)) is not None:
-            message.timestamp = now_s
-            if own.steps_back > len(sessions[message.channel]):
-                sessions[message.channel].append(len(values) // 5)
-            _keep(decoder.handle(message), decoder, values)
-    for _, decoder, values in buses.values():
-        _keep(decoder.flush(), decoder, values)
-    counts = {channel: len(values) for channel, (_, _, values) in buses.items()}
-    channel = max(counts, key=counts.__getitem__)
-    own, decoder, values = buses[channel]
-    statistics = decoder.statistics
-    if not values:
-        raise _without_current(path, vehicle, statistics)
-    remarks = [*vehicle.remarks, *capture.info.remarks]
-    remarks += [*_losses(statistics), *decoder.wrong_periods.values()]
-    remarks += decoder.never_decoded.values()
-    if sum(bool(each[2]) for each in buses.values()) > 1:
+    capture = open_vehicle_capture(path, vehicle)
+    buses: dict[Channel | None, _Bus] = {}
+    for bus, message in frames_of_buses(capture, buses, partial(_Bus, vehicle)):
+        bus.add(message)
+    for bus in buses.values():
+        bus.keep(bus.decoder.flush())
+    channel = max(buses, key=lambda each: len(buses[each].values))
+    bus = buses[channel]
+    if not bus.values:
+        raise _without_current(path, vehicle, bus.decoder.statistics)
+    remarks = [*vehicle.remarks, *capture.info.remarks, *_losses(bus.decoder.statistics)]
+    remarks += [*bus.decoder.wrong_periods.values(), *bus.decoder.never_decoded.values()]
+    if sum(bool(each.values) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
-    remarks += _of_time(recorded.name, own, len(sessions[channel]))
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
+    if isinstance(bus.time, ReplayClock):
+        remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
+    if bus.time.beginnings:
+        remarks.append(f"the replay clock starts again {bus.time.beginnings} times")
+    if bus.sessions:
+        remarks.append(f"the stamps start again: {len(bus.sessions) + 1} sessions in one file")
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
     _refuse_wrapped(current_a, vehicle, path)
     return CaptureSamples(
         time_s,
@@ -300,26 +291,35 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         soc_pct,
         str(path),
         vehicle.temperature_source,
-        statistics,
+        bus.decoder.statistics,
         capture.info,
         tuple(remarks),
-        tuple(sessions[channel]),
+        tuple(bus.sessions),
     )
 
 
-def _keep(sample: Sample | None, decoder: SampleDecoder, values: array[float]) -> None:
-    if sample is not None:
-        values.extend((*sample, decoder.reference_soc_pct))
+class _Bus:
+    """One bus of a capture: its time, its decoder, and its samples with the car's own SoC.
 
+    `sessions` are the samples at which the stamps start again.
+    """
 
-def _of_time(name: TimeSourceName, source: TimeSource, steps_back: int) -> Iterator[str]:
-    """Yield what the stamps of a capture are, and whether they start again."""
-    if name == "replay-clock":
-        yield "a recorded replay: time is its log's (REPLAY_CLOCK)"
-    if source.beginnings:
-        yield f"the replay clock starts again {source.beginnings} times"
-    if steps_back:
-        yield f"the stamps start again: {steps_back + 1} sessions in one file"
+    def __init__(self, vehicle: Vehicle, source: TimeSourceName) -> None:
+        self.time, self.decoder = time_source(source), SampleDecoder(vehicle)
+        self.values, self.sessions = array("d"), list[int]()
+
+    def add(self, message: can.Message) -> None:
+        """Decode a frame at its bus time."""
+        if (now_s := self.time.time_of(message)) is not None:
+            message.timestamp = now_s
+            if self.time.steps_back > len(self.sessions):
+                self.sessions.append(len(self.values) // 5)
+            self.keep(self.decoder.handle(message))
+
+    def keep(self, sample: Sample | None) -> None:
+        """Add a sample, if any."""
+        if sample is not None:
+            self.values.extend((*sample, self.decoder.reference_soc_pct))
 
 
 def _without_current(

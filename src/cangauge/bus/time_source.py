@@ -12,23 +12,22 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
-from functools import lru_cache
-from typing import Final
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, TypeVar
 
 import can
+from can.typechecking import Channel
 
-from cangauge._resources import shared_file
-from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
+from cangauge.bus.open import Stamps
 from cangauge.bus.protection import CRC_ONLY_RULE
 from cangauge.estimation.counting import LATEST_S
 from cangauge.settings import REPLAY_CLOCK_ID, TimeSourceName
 
+_Bus = TypeVar("_Bus")
+
 MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
 
-COUNT_BYTES: Final = 5
-"""Length of a REPLAY_COUNT: 32 bits and the CRC."""
 COUNT_EVERY: Final = 64
 """Log times between two REPLAY_COUNT: less than 1 % more frames."""
 STEP_BACK_US: Final = 1_000_000
@@ -69,11 +68,10 @@ class ReceiveTime:
         return now_us / MICROSECONDS
 
 
-KERNEL_TOLERANCE_S: Final = 0.02
-DRIVER_TOLERANCE_S: Final = 0.25
-"""Difference of a stamp from the monotonic clock that is no error [s]. Of a kernel's: both clocks
-are of one machine, the rest is scheduling between two readings. Of others: an adapter's own clock,
-delivered with its latency."""
+TOLERANCE_S: Final[dict[Stamps, float]] = {"kernel": 0.02, "sender": 0.02, "driver": 0.25}
+"""Difference of a stamp from the monotonic clock that is no error [s], by the stamps' origin. Of
+this machine's clocks it is scheduling between two readings; an adapter delivers the time of its own
+clock with its latency."""
 STEP_AFTER_S: Final = 1.0
 """Time over which stamps must be off by the same amount to prove a set clock [s]."""
 UNCERTAIN_AFTER_S: Final = 2.0
@@ -211,67 +209,66 @@ def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
     )
 
 
-def log_time_us(data: bytes | bytearray) -> int | None:
-    """Return the time in the payload of a REPLAY_CLOCK [µs]; None for a wrong CRC or length."""
-    is_whole = len(data) == 8 and CRC_ONLY_RULE.is_whole(data)
-    return int(_clock_codec().decode(data)) if is_whole else None
-
-
 def is_count(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
     """Return whether a frame is a REPLAY_COUNT: how many REPLAY_CLOCK came before it."""
     is_candidate = message.arbitration_id == clock_id - 1 and not message.is_extended_id
-    return (
-        is_candidate and len(message.data) == COUNT_BYTES and CRC_ONLY_RULE.is_whole(message.data)
-    )
+    return is_candidate and len(message.data) == 5 and CRC_ONLY_RULE.is_whole(message.data)
 
 
-class RecordedTime:
-    """Which bus time a capture has: log time, if its first frame with REPLAY_CLOCK's id is one.
+def log_time_us(data: bytes | bytearray) -> int | None:
+    """Return the time in the payload of a REPLAY_CLOCK [µs]; None for a wrong CRC or length."""
+    is_whole = len(data) == 8 and CRC_ONLY_RULE.is_whole(data)
+    return int.from_bytes(data[:-1], "little", signed=True) if is_whole else None
 
-    A car's own message of that id has another CRC. `name` is known at the end of the capture.
+
+def clock_frame(time_us: int, clock_id: int = REPLAY_CLOCK_ID) -> can.Message:
+    """Return the REPLAY_CLOCK of a log time [µs]."""
+    return _with_crc(clock_id, time_us.to_bytes(7, "little", signed=True))
+
+
+def count_frame(sent: int, clock_id: int = REPLAY_CLOCK_ID) -> can.Message:
+    """Return the REPLAY_COUNT after `sent` frames with log times."""
+    return _with_crc(clock_id - 1, (sent % (1 << 32)).to_bytes(4, "little"))
+
+
+def _with_crc(frame_id: int, content: bytes) -> can.Message:
+    data = CRC_ONLY_RULE.protect(content + bytes(1), 0)
+    return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)
+
+
+# --- Captures
+
+
+def recorded_time_source(
+    messages: Iterable[can.Message], clock_id: int = REPLAY_CLOCK_ID
+) -> TimeSourceName:
+    """Return which bus time a capture has: log time, if its first frame with the id is a clock.
+
+    A car's own message of that id has another CRC.
     """
-
-    def __init__(self, clock_id: int = REPLAY_CLOCK_ID) -> None:
-        self.name: TimeSourceName = "receive"
-        self._id, self._is_known = clock_id, False
-
-    def begins_replay(self, message: can.Message) -> bool:
-        """Return whether a replay begins with this frame: those before it have no log time."""
-        if self._is_known or not is_clock(message, self._id):
-            return False
-        self._is_known = True
-        if log_time_us(message.data) is None:
-            return False
-        self.name = "replay-clock"
-        return True
+    first = next((each for each in messages if is_clock(each, clock_id)), None)
+    return "receive" if first is None or log_time_us(first.data) is None else "replay-clock"
 
 
-class ClockFrames:
-    """Encode log times as REPLAY_CLOCK frames."""
+def frames_of_buses(
+    messages: Iterable[can.Message],
+    buses: dict[Channel | None, _Bus],
+    open_bus: Callable[[TimeSourceName], _Bus],
+    clock_id: int = REPLAY_CLOCK_ID,
+) -> Iterator[tuple[_Bus, can.Message]]:
+    """Yield the frames of a capture, each with its bus, from the beginning of a replay if any.
 
-    def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
-        self._id, self._codec = frame_id, _clock_codec()
-
-    def at(self, time_us: int) -> can.Message:
-        """Return the frame of a log time [µs]."""
-        payload = bytearray(8)
-        self._codec.encode_into(payload, float(time_us))
-        return self._frame(self._id, payload)
-
-    def count(self, sent: int) -> can.Message:
-        """Return the REPLAY_COUNT after so many frames with log times."""
-        payload = (sent % (1 << 32)).to_bytes(COUNT_BYTES - 1, "little") + b"\0"
-        return self._frame(self._id - 1, payload)
-
-    @staticmethod
-    def _frame(frame_id: int, payload: bytes | bytearray) -> can.Message:
-        data = CRC_ONLY_RULE.protect(payload, 0)
-        return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)
-
-
-@lru_cache(maxsize=1)
-def _clock_codec() -> SignalCodec:
-    path = shared_file("dbc", "soc_estimate.dbc")
-    message = load_dbc(path).get_message_by_name("REPLAY_CLOCK")
-    signal = message.get_signal_by_name("log_time_us")
-    return signal_codec(message, signal, source=path, field="REPLAY_CLOCK")
+    Each bus has its own time: stamps of two buses can be of two adapters. `open_bus` makes one by
+    its time source; `buses` holds them by channel, and is emptied where a replay begins.
+    """
+    source: TimeSourceName = "receive"
+    is_known = False
+    for message in messages:
+        if not is_known and is_clock(message, clock_id):
+            is_known = True
+            source = recorded_time_source([message], clock_id)
+            if source == "replay-clock":
+                buses.clear()
+        if message.channel not in buses:
+            buses[message.channel] = open_bus(source)
+        yield buses[message.channel], message

@@ -27,7 +27,7 @@ from cangauge.bus.publish import (
     SocEstimate,
     SocReader,
 )
-from cangauge.bus.time_source import COUNT_EVERY, MICROSECONDS, ClockFrames
+from cangauge.bus.time_source import COUNT_EVERY, MICROSECONDS, clock_frame, count_frame
 from cangauge.errors import CangaugeError, InputError
 from cangauge.replay.steps import Source, Step
 from cangauge.settings import FrameIds
@@ -196,7 +196,7 @@ class _Player:
         self._bus, self._within_s, self._stop = bus, settings.acknowledge_s, stop
         self.is_max = math.isinf(settings.speed)
         self._pacer = Pacer(settings.speed, stop, self._listen_once)
-        self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
+        self._sends_clock, self._clock_id = settings.speed != 1.0, settings.ids.replay_clock
         self._reader = SocReader(settings.ids)
         self._first_us: int | None = None
         self._began_s, self._clock_us = 0.0, -1
@@ -220,11 +220,11 @@ class _Player:
             self.wait_until(self._has_room)
         if self._first_us is None:
             self._first_us, self._began_s = step.time_us, time.monotonic()
-        if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
+        if self._sends_clock and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
             if state.clock_frames % COUNT_EVERY == 0:
                 self.send_count()
-            self._send(self._clock.at(step.time_us))
+            self._send(clock_frame(step.time_us, self._clock_id))
             state.clock_frames += 1
         for frame in step.frames:
             self._send(frame)
@@ -237,8 +237,8 @@ class _Player:
 
     def send_count(self) -> None:
         """State how many log times were sent, so that the receiver finds what it has lost."""
-        if self._clock is not None:
-            self._send(self._clock.count(self.state.clock_frames))
+        if self._sends_clock:
+            self._send(count_frame(self.state.clock_frames, self._clock_id))
 
     def update(self, listen_s: float) -> ReplayState:
         """Listen until the bus is quiet, for at most `listen_s` [s]; return the state.

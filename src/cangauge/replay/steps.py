@@ -21,8 +21,8 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import (
     MICROSECONDS,
     ReceiveTime,
-    RecordedTime,
     ReplayClock,
+    recorded_time_source,
     whole_us,
 )
 from cangauge.bus.vehicle import Vehicle
@@ -132,7 +132,7 @@ class CaptureSource:
         """Yield the frames to send, stamped with log time."""
         self.dropped = 0
         clock_id = self._ids.replay_clock
-        is_replay = any(map(RecordedTime(clock_id).begins_replay, self._messages()))
+        is_replay = recorded_time_source(self._messages(), clock_id) == "replay-clock"
         clock = ReplayClock(clock_id) if is_replay else None
         # The stamps of two buses can be of two adapters.
         stamps: defaultdict[Channel | None, ReceiveTime] = defaultdict(ReceiveTime)

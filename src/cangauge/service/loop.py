@@ -19,8 +19,7 @@ from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import ESTIMATE_EVERY_S, standard_filter
 from cangauge.bus.time_source import (
-    DRIVER_TOLERANCE_S,
-    KERNEL_TOLERANCE_S,
+    TOLERANCE_S,
     StampLimiter,
     is_clock,
     log_time_us,
@@ -85,9 +84,8 @@ class Loop:
         self._own = OwnFrames(echoes=port.address.echoes)
         self._asked = OwnFrames(echoes=port.address.echoes)
         self._stamps_are_arrival = port.address.stamps != "driver"
-        self._stamps = StampLimiter(DRIVER_TOLERANCE_S)
-        if self._stamps_are_arrival:
-            self._stamps = StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())
+        offset_s = time.time() - steady_s() if self._stamps_are_arrival else math.nan
+        self._stamps = StampLimiter(TOLERANCE_S[port.address.stamps], offset_s)
         self._shift_s = 0.0
         # Start of the last iteration that drained the receive queue: later frames arrived after it.
         # Time at which the latest iteration received.

@@ -22,7 +22,7 @@ from cangauge._text import rounded
 from cangauge._typing import FloatArray
 from cangauge.bus.publish import NO_REPORT, PackReport
 from cangauge.bus.recording import CaptureSamples, capture_samples, open_vehicle_capture
-from cangauge.bus.time_source import RecordedTime
+from cangauge.bus.time_source import frames_of_buses
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
@@ -311,18 +311,17 @@ def estimate_capture(
         If the capture cannot be read, gives no sample, or its voltage is another pack's.
     """
     began = time.perf_counter()
-    recorded_time = RecordedTime(clock_id)
     buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
-    for number, message in enumerate(capture, start=1):
-        if recorded_time.begins_replay(message):
-            buses.clear()  # a live run starts here as well
-        if message.channel not in buses:
-            ids = FrameIds(replay_clock=clock_id)
-            chosen = PipelineSettings(settings or EstimatorSettings(), recorded_time.name, ids)
-            pipeline = Pipeline(vehicle, model, chosen, publishes=False)
-            buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
-        bus = buses[message.channel]
+
+    def open_bus(source: TimeSourceName) -> _Bus:
+        ids = FrameIds(replay_clock=clock_id)
+        chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
+        pipeline = Pipeline(vehicle, model, chosen, publishes=False)
+        return _Bus(source, pipeline, PackHistory(keeps_rows=keeps_pack))
+
+    frames = frames_of_buses(capture, buses, open_bus, clock_id)
+    for number, (bus, message) in enumerate(frames, start=1):
         if bus.pipeline.handle(message):
             bus.collect()
         if progress is not None and number % PROGRESS_EVERY == 0:
@@ -345,7 +344,7 @@ def estimate_capture(
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     time_s, statistics = _without_steps_back(time_s), pipeline.decoder.statistics
     unseen = pipeline.decoder.never_decoded
-    remarks = _remarks(recorded_time.name, counts, statistics.two_senders, len(found))
+    remarks = _remarks(best.source, counts, statistics.two_senders, len(found))
     recorded = CaptureSamples(
         time_s,
         current_a,
@@ -367,7 +366,7 @@ def estimate_capture(
     scores = score(table, cast("Log", recorded), time.perf_counter() - began)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     return RecordedEstimate(
-        recorded, table, scores, model, settings, origin, recorded_time.name, counts, best.pack
+        recorded, table, scores, model, settings, origin, best.source, counts, best.pack
     )
 
 
@@ -387,6 +386,7 @@ def _no_values() -> array[float]:
 class _Bus:
     """One of the buses in a capture; each has its own pipeline."""
 
+    source: TimeSourceName
     pipeline: Pipeline
     pack: PackHistory
     estimates: list[Estimate] = field(default_factory=list)

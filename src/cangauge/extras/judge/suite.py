@@ -26,7 +26,7 @@ from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.database import find_message, load_dbc, signal_codec
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
-from cangauge.bus.time_source import MICROSECONDS, ClockFrames
+from cangauge.bus.time_source import MICROSECONDS, clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.validation.twin.simulation import simulate
@@ -225,7 +225,7 @@ class _Gauge:
             signal_codec(message, signals[name], source=path, field=name)
             for name in ("soc_pct", "soc_std_pct")
         ]
-        self._vehicle, self._clock = Vehicle.load("generic"), ClockFrames()
+        self._vehicle = Vehicle.load("generic")
         self._was_ready = False
         self._answers_a_sample = 1.0
 
@@ -292,7 +292,7 @@ class _Gauge:
         columns = np.array([log.time_s, current_a, log.voltage_v, log.temperature_c])
         for number, rows in enumerate(batches if is_ready else ()):
             for row in rows[sent[rows]]:
-                self._bus.send(self._clock.at(round(since_s[row] * MICROSECONDS)))
+                self._bus.send(clock_frame(round(since_s[row] * MICROSECONDS)))
                 for frame in encoder.encode(Sample(*columns[:, row].tolist())):
                     self._bus.send(frame)
             readings[1:, number] = self._answer(int(sent[rows].sum()))
