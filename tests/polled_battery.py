@@ -87,9 +87,7 @@ def frame(frame_id: int, data: bytes) -> can.Message:
 
 def polling_service(address: BusAddress, every_s: float = 1.0) -> Service:
     pipeline = Pipeline(Vehicle.load("leaf_ze1_polled"), leaf_model())
-    port = BusConnection(
-        open_bus(address, pipeline.filters), address
-    )
+    port = BusConnection(open_bus(address, pipeline.filters), address)
     return Service(port, pipeline, loop_config(poll=PollConfig(every_s=every_s)))
 
 

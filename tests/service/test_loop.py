@@ -245,11 +245,11 @@ def test_a_current_read_unsigned_is_named_with_its_cure(
 def test_a_lost_bus_ends_the_loop_with_one_line_and_saves_the_state(
     bus: BrokenBus, say: str
 ) -> None:
-    port, saved = BusConnection(bus, "fake bus"), list[int]()  # type: ignore[arg-type] # has what is used
+    port, saved = BusConnection(bus, BusAddress("virtual", "fake")), list[int]()  # type: ignore[arg-type] # has what is used
     loop = Loop(
         port, Pipeline(GENERIC, leaf_model()), loop_config(), checkpoint=lambda: saved.append(1)
     )
-    with pytest.raises(BusError, match=f"fake bus: {say}") as lost:
+    with pytest.raises(BusError, match=f"virtual fake: {say}") as lost:
         loop.run(never)
     assert lost.value.exit_code == 1
     assert saved == [1]
