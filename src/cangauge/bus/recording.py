@@ -262,8 +262,8 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     the capture cannot be read, or gives no sample.
     """
     capture = open_vehicle_capture(path, vehicle)
-    buses: dict[Channel | None, _Bus] = {}
-    for bus, message in frames_of_buses(capture, buses, partial(_Bus, vehicle)):
+    buses: dict[Channel | None, _RecordedBus] = {}
+    for bus, message in frames_of_buses(capture, buses, partial(_RecordedBus, vehicle)):
         bus.add(message)
     for bus in buses.values():
         bus.keep(bus.decoder.flush())
@@ -298,7 +298,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     )
 
 
-class _Bus:
+class _RecordedBus:
     """One bus of a capture: its time, its decoder, and its samples with the car's own SoC.
 
     `sessions` are the samples at which the stamps start again.

@@ -23,7 +23,7 @@ from cangauge.bus.protection import CRC_ONLY_RULE
 from cangauge.estimation.counting import LATEST_S
 from cangauge.settings import REPLAY_CLOCK_ID, TimeSourceName
 
-_Bus = TypeVar("_Bus")
+_T = TypeVar("_T")
 
 MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
@@ -252,10 +252,10 @@ def recorded_time_source(
 
 def frames_of_buses(
     messages: Iterable[can.Message],
-    buses: dict[Channel | None, _Bus],
-    open_bus: Callable[[TimeSourceName], _Bus],
+    buses: dict[Channel | None, _T],
+    open_bus: Callable[[TimeSourceName], _T],
     clock_id: int = REPLAY_CLOCK_ID,
-) -> Iterator[tuple[_Bus, can.Message]]:
+) -> Iterator[tuple[_T, can.Message]]:
     """Yield the frames of a capture, each with its bus, from the beginning of a replay if any.
 
     Each bus has its own time: stamps of two buses can be of two adapters. `open_bus` makes one by
