@@ -116,7 +116,7 @@ class Conformance:
             )
 
     def test_recognised_by_content_alone(self, path: Path) -> None:
-        assert open_capture(path)._kind is self.reader
+        assert open_capture(path).info.format == self.reader.name
 
     def test_packed_and_from_a_file_object(self, path: Path, tmp_path: Path) -> None:
         plain = self.facts(self.reader(path))
@@ -403,13 +403,13 @@ class TestAscOfDifferences(Conformance):
 
 
 class TestBlf(Written):
-    reader = library.BlfReader
+    reader = library.READERS[0]
     writer = can.BLFWriter
     kinds: ClassVar = {"remote": True, "error": True, "fd": True}
 
 
 class TestTrc(Written):
-    reader = library.TrcReader
+    reader = library.READERS[1]
     writer = can.TRCWriter
     has_channels = False
     is_relative = True
@@ -417,7 +417,7 @@ class TestTrc(Written):
 
 
 class TestCsv(Written):
-    reader = library.CsvReader
+    reader = library.READERS[3]
     writer = can.CSVWriter
     kinds: ClassVar = {"remote": True, "error": True}
     has_channels = False

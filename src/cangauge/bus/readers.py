@@ -21,7 +21,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from itertools import chain, islice, pairwise
 from pathlib import Path
-from typing import IO, Any, ClassVar, Final, Literal, cast
+from typing import IO, Any, ClassVar, Final, Literal, Self, cast
 
 import can
 from can.io.blf import BLFParseError
@@ -117,6 +117,11 @@ class CaptureReader(MessageReader, ABC):
         self.damage: str | None = None
         self.remarks: list[str] = []
         self._is_bus_time = False
+
+    @classmethod
+    def of(cls, name: str, **attributes: object) -> type[Self]:
+        """Return the reader of a format that differs from others in its attributes alone."""
+        return cast("type[Self]", type(name, (cls,), {"name": name, **attributes}))
 
     def stop(self) -> None:
         """Close the file."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
@@ -28,29 +29,23 @@ class LibraryReader(BinaryReader):
     ----------
     library : callable
         Class of python-can, or a function, that takes a file object or lines, and yields frames.
-    is_text : bool
-    marks : tuple of bytes
-        One of these begins a file.
-    comments : tuple of str
-        One of these begins a line that states no frame.
+    mark : bytes
+        Regular expression of the beginning of a file.
+    comment : str
+        Of a text: what begins a line that states no frame; "" for a binary format.
     given : int
         Other lines that python-can was given: it is silent about those that it leaves out.
     """
 
     library: ClassVar[Callable[..., Any]]
-    is_text: ClassVar[bool] = True
-    marks: ClassVar[tuple[bytes, ...]]
-    comments: ClassVar[tuple[str, ...]] = (";",)
+    mark: ClassVar[bytes]
+    comment: ClassVar[str] = ""
     given = _unread = 0
 
     @classmethod
     def matches(cls, head: bytes) -> bool:
         """Return whether the file begins with the format's mark."""
-        return head.startswith(cls.marks)
-
-    def content(self) -> Any:
-        """Return what the class of python-can reads."""
-        return self.lines() if self.is_text else self.raw
+        return re.match(cls.mark, head) is not None
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of a text; a cut one is damage, because it may read as a frame."""
@@ -59,14 +54,14 @@ class LibraryReader(BinaryReader):
         while line := text.readline(MAX_LINE):
             if not line.endswith("\n"):
                 raise EOFError("it ends in a line")
-            self.given += not line.isspace() and not line.startswith(self.comments)
+            self.given += not line.isspace() and not line.startswith(self.comment)
             yield line
 
     def _of_text(self) -> Iterator[can.Message]:
         """Yield the frames; python-can stops at a malformed line, and is begun again after it."""
-        lines, head = self.content(), list[str]()
+        lines, head = self.lines(), list[str]()
         for line in lines:
-            if not line.startswith(self.comments):
+            if not line.startswith(self.comment):
                 lines = chain([line], lines)
                 break
             head.append(line)
@@ -84,7 +79,7 @@ class LibraryReader(BinaryReader):
 
     def read(self) -> Iterator[can.Message]:
         """Yield the frames, without those whose length contradicts their DLC."""
-        source = self._of_text() if self.is_text else type(self).library(self.content())
+        source = self._of_text() if self.comment else type(self).library(self.raw)
         taken = 0
         for message in source:
             taken += 1
@@ -95,7 +90,7 @@ class LibraryReader(BinaryReader):
                 self.skip(None)
         left_out = getattr(source, "objects", self.given) - taken - self._unread
         if left_out > 0:
-            what = "line" if self.is_text else "object"
+            what = "line" if self.comment else "object"
             self.remarks.append(
                 f"{counted(left_out, what)} left out, which python-can does not read"
             )
@@ -123,6 +118,9 @@ class _EndingBlf(can.BLFReader):
 
     objects = 0
 
+    def __init__(self, raw: Any) -> None:
+        super().__init__(_InPieces(raw))  # type: ignore[arg-type]
+
     def _parse_data(self, data: bytes) -> Iterator[can.Message]:
         place = data.find(b"LOBJ", 0, 8)
         while 0 <= place <= len(data) - _OBJECT.size:
@@ -134,74 +132,52 @@ class _EndingBlf(can.BLFReader):
         yield from super()._parse_data(data)
 
 
-class BlfReader(LibraryReader):
-    """Vector BLF."""
-
-    name, library, is_text, marks = "Vector BLF", _EndingBlf, False, (b"LOGG",)
-
-    def content(self) -> _InPieces:
-        """Return the file, read in pieces."""
-        return _InPieces(self.raw)
-
-
 def _trc_frames(lines: Iterator[str]) -> Iterator[can.Message]:
-    for message in can.TRCReader(lines):  # type: ignore[arg-type]
+    for message in can.TRCReader(_of_known_version(lines)):  # type: ignore[arg-type]
         if message.is_fd:  # python-can leaves the code of the length
             message.dlc = dlc2len(message.dlc)
         yield message
 
 
-class TrcReader(LibraryReader):
-    """PEAK TRC; version 1.2, which python-can does not know, lacks the sixth column of 1.3."""
-
-    name, library = "PEAK TRC", _trc_frames
-
-    @classmethod
-    def matches(cls, head: bytes) -> bool:
-        """Return whether it begins with PEAK's comments."""
-        begin = head[:4000]
-        return head.startswith(b";") and (b";$FILEVERSION=" in begin or b"PCAN" in begin)
-
-    def content(self) -> Iterator[str]:
-        """Yield the lines as of a version that python-can knows."""
-        is_1_2 = False
-        for line in self.lines():
-            cells = line.split()
-            if line.startswith(";$FILEVERSION=1.2"):
-                is_1_2 = True
-                yield ";$FILEVERSION=1.3\n"
-            elif line.startswith(";$STARTTIME="):
-                yield line.rstrip("; \r\n")
-            elif is_1_2 and len(cells) > 5 and cells[5] != "-":
-                yield " ".join([*cells[:5], "-", *cells[5:]])
-            else:
-                yield line
+def _of_known_version(lines: Iterator[str]) -> Iterator[str]:
+    """Yield the lines of a TRC as of version 1.3, which has a sixth column that 1.2 lacks."""
+    is_1_2 = False
+    for line in lines:
+        cells = line.split()
+        if line.startswith(";$FILEVERSION=1.2"):
+            is_1_2 = True
+            yield ";$FILEVERSION=1.3\n"
+        elif line.startswith(";$STARTTIME="):
+            yield line.rstrip("; \r\n")
+        elif is_1_2 and len(cells) > 5 and cells[5] != "-":
+            yield " ".join([*cells[:5], "-", *cells[5:]])
+        else:
+            yield line
 
 
-class CsvReader(LibraryReader):
-    """python-can's CSV."""
-
-    name, library = "python-can CSV", can.CSVReader
-    marks = (b"timestamp,arbitration_id,extended,remote,error,dlc,data",)
-    comments = ("timestamp,arbitration_id",)
-
-
-class Mf4Reader(LibraryReader):
-    """ASAM MF4 with bus logging."""
-
-    name, library, is_text = "ASAM MF4", can.MF4Reader, False
-    marks = (b"MDF     ", b"UnFinMF ")
-
-    def read(self) -> Iterator[can.Message]:
-        """Yield the frames; raise InputError if asammdf is not installed."""
-        if find_spec("asammdf") is None:
-            raise InputError(
-                "reading ASAM MF4 needs another package: No module named 'asammdf'",
-                source=self.source,
-                cure="pip install 'cangauge[mf4]'",
-            )
-        self.raw = io.BytesIO(self.raw.read())  # asammdf goes back and forth in it
-        yield from super().read()
+def _mf4_frames(raw: Any) -> Any:
+    if find_spec("asammdf") is None:
+        raise InputError(
+            "reading ASAM MF4 needs another package: No module named 'asammdf'",
+            source=getattr(raw, "name", None),
+            cure="pip install 'cangauge[mf4]'",
+        )
+    return can.MF4Reader(io.BytesIO(raw.read()))  # asammdf goes back and forth in it
 
 
-READERS: Final = (BlfReader, TrcReader, Mf4Reader, CsvReader)
+READERS: Final = (
+    LibraryReader.of("Vector BLF", library=_EndingBlf, mark=b"LOGG"),
+    LibraryReader.of(
+        "PEAK TRC",
+        library=_trc_frames,
+        mark=rb"(?s)(?=;).{0,3999}(;\$FILEVERSION=|PCAN)",
+        comment=";",
+    ),
+    LibraryReader.of("ASAM MF4", library=_mf4_frames, mark=b"MDF     |UnFinMF "),
+    LibraryReader.of(
+        "python-can CSV",
+        library=can.CSVReader,
+        mark=b"timestamp,arbitration_id,extended,remote,error,dlc,data",
+        comment="timestamp,arbitration_id",
+    ),
+)

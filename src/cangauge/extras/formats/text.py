@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import pairwise
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import can
 
@@ -110,44 +110,36 @@ class _CandumpFormat(LineFormat):
         return candump_frame(time, groups["channel"], groups["id"], content, groups["length"])
 
 
-def _format(
-    name: str, pattern: str, base: type[LineFormat] = LineFormat, **more: object
-) -> type[LineFormat]:
-    """Return the reader of a format by its attributes."""
-    reader: Any = type(name, (base,), {"name": name, "pattern": pattern, **more})
-    return reader  # type: ignore[no-any-return]
-
-
 # ParserFlags <tab> Ch <tab> Counter <tab> T/R <tab> Time <tab> Flags <tab> CAN ID <tab> Len …
 # 1 <tab> 0 <tab> 14767 <tab> RX <tab> 1052620673 <tab> <tab> 0x000001da <tab> 8 <tab> 0xc8 …
-TableReader = _format(
+TableReader = LineFormat.of(
     "tab-separated table",
-    r"[^\t]*\t(?P<bus>\d+)\t[^\t]*\t(?P<way>\w+)\t(?P<ms>\d+)\t[^\t]*\t(?P<id>0x\w+)"
+    pattern=r"[^\t]*\t(?P<bus>\d+)\t[^\t]*\t(?P<way>\w+)\t(?P<ms>\d+)\t[^\t]*\t(?P<id>0x\w+)"
     rf"\t(?P<length>\d+)\t(?:0x)?(?P<data>(?:{_X}| )*)\s",
     stamps="ms",
     other="ParserFlags\t",
 )
 # Also as SavvyCAN writes it.
 # 1632509059.541604 2R11 174 00 00 00 aa 0f 00 00 00
-CrtdReader = _format(
+CrtdReader = LineFormat.of(
     "CRTD (OVMS)",
-    r"(?P<time>\d+\.\d+) (?P<bus>\d*)(?P<way>[RT])(?:(?P<short>11)|(?P<long>29))"
+    pattern=r"(?P<time>\d+\.\d+) (?P<bus>\d*)(?P<way>[RT])(?:(?P<short>11)|(?P<long>29))"
     rf" (?P<id>{_X}{{1,8}})(?P<data>(?: {_X}{{2}})*)\s*$",
     states_length=False,
     other=r"\d+\.\d+ \d*C[A-Z]{2}\b",
 )
 # Of its web page; its ids are not padded, else it looks like candump's.
 # (216.112) RX0 7A [8] 00 00 D2 B6 BC 5E 00 00
-BatteryEmulatorReader = _format(
+BatteryEmulatorReader = LineFormat.of(
     "Battery-Emulator log",
-    r"\((?P<time>\d++\.\d++)\) (?P<channel>(?P<way>[RTrt])[Xx]\d++)"
+    pattern=r"\((?P<time>\d++\.\d++)\) (?P<channel>(?P<way>[RTrt])[Xx]\d++)"
     rf" (?P<id>{_X}{{1,8}}) \[(?P<length>\d++)\](?P<data>(?: {_X}{{2}}\b)*)",
 )
 # SavvyCAN's generic CSV.
 # 4F5,FF 34 23 45 24 E4
-IdDataReader = _format(
+IdDataReader = LineFormat.of(
     "SavvyCAN id and data CSV",
-    rf"(?P<id>{_X}{{3,8}}),(?P<data>(?:{_X}{{2}} ?){{0,64}})\s*$",
+    pattern=rf"(?P<id>{_X}{{3,8}}),(?P<data>(?:{_X}{{2}} ?){{0,64}})\s*$",
     stamps="none",
     states_length=False,
     begins=r"\s*ID,Data",
@@ -155,9 +147,9 @@ IdDataReader = _format(
 )
 # Of openpilot.
 # 15.460,0x440,1,0x4000800000000000
-CabanaReader = _format(
+CabanaReader = LineFormat.of(
     "cabana CSV",
-    r"(?P<time>\d+(?:\.\d+)?),(?:(?P<id>0x[0-9A-Fa-f]{1,8})|(?P<decimal>0|[1-9]\d{0,8}))"
+    pattern=r"(?P<time>\d+(?:\.\d+)?),(?:(?P<id>0x[0-9A-Fa-f]{1,8})|(?P<decimal>0|[1-9]\d{0,8}))"
     r",(?P<bus>\d{1,9}),(?:0x)?(?P<data>(?:[0-9A-Fa-f]{2}){0,64})\s*$",
     states_length=False,
     begins="time,addr,bus,data",
@@ -167,15 +159,15 @@ CabanaReader = _format(
 # @ TEXT @ 3 @ 64 @ 0 @ 1149 @ 7459 @ 00:00:07.459 @
 # 26,641405 <tab> 1 <tab> 00000004 <tab> 112 <tab> 8 <tab> 00 20 C1 0E 01 72 89 00 <tab> …
 _CARBUS: Final = r"\t(?P<bus>\d+)\t[^\t]*\t(?P<id>\w+)\t(?P<length>\d+)\t(?P<data>[^\t]*)"
-CarbusReader = _format(
+CarbusReader = LineFormat.of(
     "CARBUS Analyzer trace",
-    rf"(?P<clock>\d+),(?P<us>\d+){_CARBUS}",
+    pattern=rf"(?P<clock>\d+),(?P<us>\d+){_CARBUS}",
     begins="@ TEXT @ [3-9] @",
     other="[@#]",
 )
-CarbusMsReader = _format(
+CarbusMsReader = LineFormat.of(
     "CARBUS Analyzer trace",
-    rf"(?P<clock>\d+),(?P<ms>\d+){_CARBUS}",
+    pattern=rf"(?P<clock>\d+),(?P<ms>\d+){_CARBUS}",
     stamps="ms",
     begins="@ TEXT @ [0-2] @",
     other="[@#]",
@@ -184,9 +176,9 @@ CarbusMsReader = _format(
 # > <tab> 2 <tab>  17:18:39.355:2240.00 <tab> St <tab> 0x112 <tab> 0 <tab> 8 <tab> … <tab> p:2
 # Minutes, seconds and milliseconds are not padded (17:19:9.69 is 9.069 s); after them stand
 # the microseconds since the frame before. Bytes that a frame lacks are blank.
-CanHackerReader = _format(
+CanHackerReader = LineFormat.of(
     "CAN Hacker log",
-    r">\t[^\t]*\t\s*(?P<clock>\d{1,2}:\d{1,2}:\d{1,2})\.(?P<ms>\d{1,3})(?::\d+(?:\.\d+)?)?"
+    pattern=r">\t[^\t]*\t\s*(?P<clock>\d{1,2}:\d{1,2}:\d{1,2})\.(?P<ms>\d{1,3})(?::\d+(?:\.\d+)?)?"
     r"\t(?:St|(?P<long>Ext))\t(?P<id>\w+)\t[^\t]*\t(?P<length>\d+)"
     rf"(?P<data>(?:\t{_X}{{2}})*)(?:\t *)*?\tp:(?P<bus>\d+)\s*$",
     stamps="ms",
@@ -195,9 +187,9 @@ CanHackerReader = _format(
 # Of the tool of CANalyst-II and its kin: time of day in milliseconds.
 # NO    Direction  Time Scale        Frame Type      Frame Format     Frame ID  Length  Data
 # 0     Receive    18:00:00:125      Data frame      Standard frame   00000356  8       f2 0e …
-UsbCanReader = _format(
+UsbCanReader = LineFormat.of(
     "USB-CAN tool text",
-    r"(?i)\s*+\d+[\s,]++(?P<way>Receive|Send|Transmit)[\s,]++(?P<clock>\d{1,2}:\d\d:\d\d)[:.]"
+    pattern=r"(?i)\s*+\d+[\s,]++(?P<way>Receive|Send|Transmit)[\s,]++(?P<clock>\d{1,2}:\d\d:\d\d)[:.]"
     r"(?P<decimals>\d{1,6})[\s,]++(?:Data|(?P<remote>Remote)) frame[\s,]++"
     r"(?:(?P<short>Standard)|(?P<long>Extended)) frame[\s,]++(?:0x)?(?P<id>[0-9A-F]{1,8})"
     r"[\s,]++(?:0x)?(?P<length>\d{1,2})[\s,]*+(?P<data>(?:[0-9A-F]{2} ?)*+)\s*$",
@@ -206,9 +198,9 @@ UsbCanReader = _format(
 )
 # Of slcan (Lawicel) adapters: milliseconds of a minute, in four digits.
 # t35680EFA003EA000009AB0
-SlcanReader = _format(
+SlcanReader = LineFormat.of(
     "slcan text with stamps",
-    rf"(?:(?P<short>t)|(?P<long>T))(?P<id>(?<=t){_X}{{3}}|(?<=T){_X}{{8}})(?P<length>[0-8])"
+    pattern=rf"(?:(?P<short>t)|(?P<long>T))(?P<id>(?<=t){_X}{{3}}|(?<=T){_X}{{8}})(?P<length>[0-8])"
     rf"(?P<data>(?:{_X}{{2}})*)(?P<hex_ms>{_X}{{4}})\s*$",
     stamps="ms",
     other=r"(?i)[rRzZFVNCOSMm][0-9A-F]*\s*$",
@@ -221,13 +213,12 @@ _CANDUMP: Final = (
 )
 #  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
 #  (2015-07-09 06:17:32.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
-CandumpReader = _format(
+CandumpReader = _CandumpFormat.of(
     "candump with stamps",
-    rf"\s*+\((?P<date>\d{{4}}-\d\d-\d\d \d\d:\d\d:)?(?P<time>\d++\.\d++)\)\s*+{_CANDUMP}",
-    _CandumpFormat,
+    pattern=rf"\s*+\((?P<date>\d{{4}}-\d\d-\d\d \d\d:\d\d:)?(?P<time>\d++\.\d++)\)\s*+{_CANDUMP}",
 )
-UnstampedCandumpReader = _format(
-    "candump without stamps", rf"\s*+{_CANDUMP}", _CandumpFormat, stamps="none"
+UnstampedCandumpReader = _CandumpFormat.of(
+    "candump without stamps", pattern=rf"\s*+{_CANDUMP}", stamps="none"
 )
 
 _FRAMES_FOR_UNIT: Final = 100
