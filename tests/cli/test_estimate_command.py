@@ -235,8 +235,8 @@ def test_a_capture_is_estimated_as_the_service_does(part: Log, drive: Path) -> N
     assert len(table) == found["rows"] == len(part)
     for name in NUMBERS:
         assert np.array_equal(table[name].to_numpy(), getattr(live.table, name), equal_nan=True)
-    assert live.pack.report is not None
-    report = json.loads(json.dumps(live.pack.report.to_dict()))
+    assert live.report is not None
+    report = json.loads(json.dumps(live.report.to_dict()))
     assert {name: found[name] for name in report} == report
     assert report["cells"]["weakest"] == 12
     assert read_table("pack.parquet")["cell_soc_pct"].to_pylist()[-1] == report["cells"]["soc_pct"]

@@ -86,8 +86,8 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert recorded.table.soc_pct.size == 1200
     for name in ("time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct"):
         assert ended.json["estimate"][name] == getattr(recorded.table, name)[-1], name
-    assert recorded.pack.report is not None
-    offline = json.loads(json.dumps(recorded.pack.report.to_dict()))
+    assert recorded.report is not None
+    offline = json.loads(json.dumps(recorded.report.to_dict()))
     assert {name: ended.json[name] for name in offline} == offline
 
 

@@ -121,6 +121,7 @@ def estimate_command(
     from cangauge.logs.canonical import write_table
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
+    from cangauge.service.offline import pack_columns
 
     settings = EstimatorSettings(
         method=method,
@@ -144,7 +145,7 @@ def estimate_command(
         parts = {what: all_of_them.enter_context(atomic_path(p)) for what, p in files.items() if p}
         write_estimates(parts["output"], done.recorded.time_s, done.table)
         if pack is not None:
-            write_table(done.pack.columns, parts["pack"])
+            write_table(pack_columns(done.pack_rows), parts["pack"])
         if report is not None:
             parts["report"].write_text(page, encoding="utf-8")
     for warning in done.warnings:
@@ -202,7 +203,7 @@ def _of_log(
 ) -> RecordedEstimate:
     from cangauge.logs.charge import refuse_contradictions
     from cangauge.logs.gaps import USUAL_STEPS
-    from cangauge.service.offline import PackHistory, estimate_recorded_log
+    from cangauge.service.offline import estimate_recorded_log
     from cangauge.settings import GAP_S
 
     log = reading.load(path)
@@ -210,8 +211,6 @@ def _of_log(
         refuse_contradictions([log], settings.capacity_ah or model.capacity_ah)
     if settings.initial_soc_pct is not None:
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
-    cells = reading.cells_of(log)
-    history = PackHistory(keeps_rows=keeps_pack, cells=cells, duration_s=log.duration_s)
     with progress() as show_line:
 
         def show(count: int) -> None:
@@ -222,7 +221,8 @@ def _of_log(
             model,
             settings,
             soc_from_log=soc_from_log,
-            pack=history,
+            cells=reading.cells_of(log),
+            keeps_pack=keeps_pack,
             progress=show,
         )
     if (gap_s := done.settings.gap_s) >= USUAL_STEPS * GAP_S:  # else the usual step is no gap

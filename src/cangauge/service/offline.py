@@ -6,12 +6,10 @@ same bit for bit.
 
 from __future__ import annotations
 
-import math
 import time
 from array import array
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from os import PathLike
 from typing import Any, Final, Literal, cast
 
@@ -27,7 +25,6 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
-from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
@@ -61,67 +58,26 @@ Origin = Literal["given", "log", "voltage"]
 """Source of the initial SoC: an option, the log's soc_pct, or the first voltages."""
 
 
-class PackHistory:
-    """Health, power and cells of a recording: at the end, in `report` (None without a sample).
+PackRows = list[tuple[float, PackReport]]
+"""Health, power and cells at times of a recording [s]."""
 
-    With `keeps_rows` also at the first sample of each interval, in `columns`: of a second, and in a
-    log of a duration [s] long enough that there are `PACK_ROWS`. `cells` are the cell voltages of
-    a log, by its rows.
-    """
 
-    def __init__(
-        self,
-        *,
-        keeps_rows: bool = False,
-        cells: CellColumns | None = None,
-        duration_s: float = 0.0,
-    ) -> None:
-        self.report: PackReport | None = None
-        self._every_s = max(PACK_EVERY_S, duration_s / PACK_ROWS)
-        self._keeps_rows = keeps_rows
-        self._cells = cells
-        self._cell_estimator: CellEstimator | None = None
-        self._row = 0
-        self._due_s = -math.inf
-        self._reports: list[tuple[float, PackReport]] = []
+def pack_columns(rows: PackRows) -> dict[str, FloatArray]:
+    """Return the rows as columns: time_s, health, power and, where known, cells; NaN: unknown."""
+    table = []
+    for time_s, report in rows:
+        parts = report.to_dict()
+        cells = {f"cell_{name}": value for name, value in (parts["cells"] or {}).items()}
+        table.append({"time_s": time_s, **parts["health"], **parts["power"], **cells})
+    return {name: np.array([row[name] for row in table], np.float64) for name in table[0]}
 
-    @property
-    def takes_samples(self) -> bool:
-        """Whether `observe` must be called for every sample."""
-        return self._keeps_rows or self._cells is not None
 
-    def observe(self, estimator: Estimator, sample: Sample) -> None:
-        """Take a sample of a log, and the estimator after it."""
-        if (cells := self._cells) is not None:
-            if self._cell_estimator is None:
-                model = estimator.voltage_model
-                self._cell_estimator = CellEstimator(model, cells.count, cells.first)
-            if self._cell_estimator.is_due(sample.time_s):
-                volts = cells.voltage_v[self._row].tolist()
-                self._cell_estimator.update(estimator.pack_tick(sample), volts, [0.0] * cells.count)
-        self._row += 1
-        self.add(sample.time_s, partial(self.report_of, estimator))
-
-    def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
-        """Keep the report of a sample's time [s], if its interval has begun."""
-        if self._keeps_rows and not self._due_s - self._every_s <= time_s < self._due_s:
-            self._due_s = time_s + self._every_s
-            self._reports.append((time_s, report()))
-
-    @property
-    def columns(self) -> dict[str, FloatArray]:
-        """The rows as columns: time_s, health, power and, where known, cells; NaN: unknown."""
-        rows = []
-        for time_s, report in self._reports:
-            parts = report.to_dict()
-            cells = {f"cell_{name}": value for name, value in (parts["cells"] or {}).items()}
-            rows.append({"time_s": time_s, **parts["health"], **parts["power"], **cells})
-        return {name: np.array([row[name] for row in rows], np.float64) for name in rows[0]}
-
-    def report_of(self, estimator: Estimator) -> PackReport:
-        """Return health and power after the estimator's latest sample, and the log's cells."""
-        cells = None if self._cell_estimator is None else self._cell_estimator.report
-        return PackReport(estimator.health, estimator.power(), cells)
+def _add_row(
+    rows: PackRows, every_s: float, time_s: float, report: Callable[[], PackReport]
+) -> None:
+    """Keep the report of a sample's time [s], if the latest row is `every_s` older, or later."""
+    if not rows or not rows[-1][0] <= time_s < rows[-1][0] + every_s:
+        rows.append((time_s, report()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +99,10 @@ class RecordedEstimate:
     time_source : {"receive", "replay-clock"}, optional
     counts : FrameCounts, optional
         Source of bus time, and frames and values by outcome, of a capture.
-    pack : PackHistory
-        Health, power and cells.
+    report : PackReport, optional
+        Health, power and cells at the end.
+    pack_rows : list
+        The same over time, where asked for.
     """
 
     recorded: Log | CaptureSamples
@@ -155,7 +113,8 @@ class RecordedEstimate:
     origin: Origin = "voltage"
     time_source: TimeSourceName | None = None
     counts: FrameCounts | None = None
-    pack: PackHistory = field(default_factory=PackHistory)
+    report: PackReport | None = None
+    pack_rows: PackRows = field(default_factory=list)
 
     @property
     def reason_shares(self) -> dict[str, float]:
@@ -186,8 +145,8 @@ class RecordedEstimate:
             capacity_ah = self.settings.capacity_ah or self.model.capacity_ah
             difference = difference_from_reference(self.recorded, capacity_ah)
             found.extend([] if difference is None else [f"{difference}."])
-        if self.pack.report is not None:
-            found += [f"{notice[:1].upper()}{notice[1:]}." for notice in self.pack.report.notices]
+        if self.report is not None:
+            found += [f"{notice[:1].upper()}{notice[1:]}." for notice in self.report.notices]
         return found
 
     def to_dict(self) -> dict[str, Any]:
@@ -206,7 +165,7 @@ class RecordedEstimate:
             "capacity_ah": settings.capacity_ah or self.model.capacity_ah,
             "max_gap_s": settings.gap_s,
             "reasons": self.reason_shares,
-            **(NO_REPORT if self.pack.report is None else self.pack.report.to_dict()),
+            **(NO_REPORT if self.report is None else self.report.to_dict()),
             **of_capture,
         }
 
@@ -217,7 +176,8 @@ def estimate_recorded_log(
     settings: EstimatorSettings,
     *,
     soc_from_log: bool = True,
-    pack: PackHistory | None = None,
+    cells: CellColumns | None = None,
+    keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
     """Estimate a log.
@@ -231,8 +191,11 @@ def estimate_recorded_log(
         its usual steps.
     soc_from_log : bool
         Begin from the log's first reference SoC, counted back to its first row, if it has one.
-    pack : PackHistory, optional
-        Collects health, power and cells.
+    cells : CellColumns, optional
+        Cell voltages, by the log's rows.
+    keeps_pack : bool
+        Keep health, power and cells over time: at the first sample of each interval of a second,
+        or of a longer one that gives `PACK_ROWS`.
     progress : callable, optional
         Called with the number of samples done.
 
@@ -249,12 +212,31 @@ def estimate_recorded_log(
         start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
         settings = replace(settings, initial_soc_pct=start_pct)
     began, estimator = time.perf_counter(), make_estimator(model, settings)
-    history = PackHistory() if pack is None else pack
-    observe = partial(history.observe, estimator) if history.takes_samples else None
-    table = step_all(estimator, log, progress=progress, observe=observe)
+    weakest = None
+    if cells is not None:
+        weakest = CellEstimator(estimator.voltage_model, cells.count, cells.first)
+    rows: PackRows = []
+    every_s = max(PACK_EVERY_S, log.duration_s / PACK_ROWS)
+    volts = iter(() if cells is None else cells.voltage_v)
+
+    def report() -> PackReport:
+        found = None if weakest is None else weakest.report
+        return PackReport(estimator.health, estimator.power(), found)
+
+    def observe(sample: Sample) -> None:
+        row = next(volts, None)
+        if weakest is not None and row is not None and weakest.is_due(sample.time_s):
+            changes = [0.0] * len(row)
+            weakest.update(estimator.pack_tick(sample), row.tolist(), changes)
+        if keeps_pack:
+            _add_row(rows, every_s, sample.time_s, report)
+
+    observes = observe if keeps_pack or cells is not None else None
+    table = step_all(estimator, log, progress=progress, observe=observes)
     scores = score(table, log, time.perf_counter() - began)
-    history.report = history.report_of(estimator)
-    return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
+    return RecordedEstimate(
+        log, table, scores, model, settings, origin, report=report(), pack_rows=rows
+    )
 
 
 def require_same_pack(voltage_v: FloatArray, model: Model, source: str) -> None:
@@ -301,7 +283,7 @@ def estimate_capture(
     clock_id : int
         REPLAY_CLOCK's id.
     keeps_pack : bool
-        Keep health, power and cells of each second (`pack.columns`), not only of the end.
+        Keep health, power and cells of each second (`pack_rows`), not only of the end.
     progress : callable, optional
         Called with the number of frames read, every `PROGRESS_EVERY`.
 
@@ -318,17 +300,17 @@ def estimate_capture(
         ids = FrameIds(replay_clock=clock_id)
         chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
         pipeline = Pipeline(vehicle, model, chosen, publishes=False)
-        return _Bus(source, pipeline, PackHistory(keeps_rows=keeps_pack))
+        return _Bus(source, pipeline)
 
     frames = frames_of_buses(capture, buses, open_bus, clock_id)
     for number, (bus, message) in enumerate(frames, start=1):
         if bus.pipeline.handle(message):
-            bus.collect()
+            bus.collect(keeps_pack=keeps_pack)
         if progress is not None and number % PROGRESS_EVERY == 0:
             progress(number)
     for bus in buses.values():
         if bus.pipeline.finish():
-            bus.collect()
+            bus.collect(keeps_pack=keeps_pack)
     found = [bus for bus in buses.values() if bus.estimates]
     if not found:
         raise InputError(
@@ -339,7 +321,7 @@ def estimate_capture(
         )
     best = max(found, key=_Bus.samples)
     pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
-    best.pack.report, counts = pipeline.report(), pipeline.counts
+    counts = pipeline.counts
     settings = pipeline.estimator.settings
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     time_s, statistics = _without_steps_back(time_s), pipeline.decoder.statistics
@@ -366,7 +348,16 @@ def estimate_capture(
     scores = score(table, cast("Log", recorded), time.perf_counter() - began)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     return RecordedEstimate(
-        recorded, table, scores, model, settings, origin, best.source, counts, best.pack
+        recorded,
+        table,
+        scores,
+        model,
+        settings,
+        origin,
+        best.source,
+        counts,
+        pipeline.report(),
+        best.pack_rows,
     )
 
 
@@ -388,21 +379,24 @@ class _Bus:
 
     source: TimeSourceName
     pipeline: Pipeline
-    pack: PackHistory
     estimates: list[Estimate] = field(default_factory=list)
     # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
     values: array[float] = field(default_factory=_no_values)
+
+    pack_rows: PackRows = field(default_factory=list)
 
     def samples(self) -> int:
         """Return the number of samples so far."""
         return len(self.estimates)
 
-    def collect(self) -> None:
+    def collect(self, *, keeps_pack: bool) -> None:
+        """Keep the latest sample with its estimate, and health, power and cells if asked for."""
         sample = self.pipeline.latest_sample
         if sample is not None:
             self.estimates.append(self.pipeline.latest)
             self.values.extend((*sample, self.pipeline.decoder.reference_soc_pct))
-            self.pack.add(sample.time_s, self.pipeline.report)
+            if keeps_pack:
+                _add_row(self.pack_rows, PACK_EVERY_S, sample.time_s, self.pipeline.report)
 
 
 def _remarks(
