@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.isotp import PollTarget
+from cangauge.bus.isotp import LONGEST_GAP_S, PollTarget
 from cangauge.service.polling import (
     EXCHANGE_WITHIN_S,
     OTHER_TESTER_S,
-    REPLY_WITHIN_S,
     SLOWEST_S,
     Poller,
 )
@@ -72,7 +71,7 @@ def test_one_request_at_a_time_and_never_too_often(steps: list[tuple[float, str]
         if request is not None:
             group = request.data[2]
             assert now_s >= quiet_s
-            assert ended or now_s - max(asked_s.values()) >= REPLY_WITHIN_S
+            assert ended or now_s - max(asked_s.values()) >= LONGEST_GAP_S
             assert now_s - asked_s.get(group, -9.0) >= 2.0
             asked_s[group], ended = now_s, False
         if act == "other":
@@ -92,7 +91,7 @@ def test_silence_doubles_the_interval_until_an_answer() -> None:
     asked = [tenth / 10.0 for tenth in range(4000) if poller.due(tenth / 10.0) is not None]
     waits = [later - before for before, later in pairwise(asked)]
     assert waits[0] < waits[1] < waits[2]
-    assert SLOWEST_S <= max(waits) <= SLOWEST_S + REPLY_WITHIN_S + 0.2
+    assert SLOWEST_S <= max(waits) <= SLOWEST_S + LONGEST_GAP_S + 0.2
     assert poller.counts["unanswered"] >= len(asked) - 1
     again_s = next(at / 10.0 for at in range(4000, 5000) if poller.due(at / 10.0))
     answer(poller, PROBES, again_s + 0.1)

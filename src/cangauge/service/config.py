@@ -70,13 +70,7 @@ def key(default: Any, text: str, option: str = "", metavar: str = "", **more: An
     return setting(text, default=default, option=option, metavar=metavar, **more)
 
 
-class Strict(BaseModel):
-    """A table of keys; unknown ones are refused."""
-
-    model_config = ConfigDict(**STRICT, frozen=True)
-
-
-class PollConfig(Strict):
+class PollConfig(BaseModel, extra="forbid", frozen=True):
     """Requests for replies over ISO-TP; see `Poller`."""
 
     every_s: FiniteFloat = key(
@@ -93,73 +87,60 @@ _TOPIC: Final = r"^[^/+#\s\x00]+(/[^/+#\s\x00]+)*$"
 """Topic of MQTT without wildcards and empty levels."""
 
 
-class MqttConfig(Strict):
+class MqttConfig(BaseModel, extra="forbid", frozen=True):
     """MQTT broker that takes the state."""
 
-    broker: str = key(..., "Host name or address of the MQTT broker.", restart=True, min_length=1)
-    port: int | None = key(
-        None, "Its port.", default_text="1883, with TLS 8883", restart=True, ge=1, le=65535
-    )
-    tls: StrictBool = key(False, "Encrypt, and check its certificate.", restart=True)
+    broker: str = key(..., "Host name or address of the MQTT broker.", min_length=1)
+    port: int | None = key(None, "Its port.", default_text="1883, with TLS 8883", ge=1, le=65535)
+    tls: StrictBool = key(False, "Encrypt, and check its certificate.")
     ca_file: str | None = key(
         None,
         "PEM file of the authority that signed it.",
         default_text="the system's",
-        restart=True,
         is_path=True,
     )
-    user: str | None = key(None, "User name.", restart=True)
+    user: str | None = key(None, "User name.")
     password_file: str | None = key(
-        None, "File with the password; or in CANGAUGE_MQTT_PASSWORD.", restart=True, is_path=True
+        None, "File with the password; or in CANGAUGE_MQTT_PASSWORD.", is_path=True
     )
     topic_prefix: str = key(
         "cangauge",
         "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.",
-        restart=True,
         pattern=_TOPIC,
     )
     discovery_prefix: str = key(
         "homeassistant",
         'Home Assistant\'s prefix of discovery; "" without discovery.',
-        restart=True,
         pattern=f"{_TOPIC}|^$",
     )
     device: str | None = key(
         None,
         "Name of this service among those of the broker.",
         default_text="cangauge_HOST_CHANNEL",
-        restart=True,
         pattern=r"^[A-Za-z0-9_-]{1,64}$",
     )
-    every_s: FiniteFloat = key(
-        1.0, "Interval of the states.", unit="s", restart=True, ge=0.1, le=3600.0
-    )
+    every_s: FiniteFloat = key(1.0, "Interval of the states.", unit="s", ge=0.1, le=3600.0)
 
 
-class JudgeConfig(Strict):
+class JudgeConfig(BaseModel, extra="forbid", frozen=True):
     """A second opinion on the SoC that the battery itself publishes."""
 
-    folder: str = key(
-        ..., "Folder for its logs, judgement.json and judgement.html.", restart=True, is_path=True
-    )
-    keep: int = key(30, "Logs that are kept and judged.", restart=True, ge=1, le=1000)
+    folder: str = key(..., "Folder for its logs, judgement.json and judgement.html.", is_path=True)
+    keep: int = key(30, "Logs that are kept and judged.", ge=1, le=1000)
 
 
-class PublishConfig(Strict):
+class PublishConfig(BaseModel, extra="forbid", frozen=True):
     """A gateway to an inverter, which gets the battery's frames with the estimated SoC."""
 
-    profile: Literal["pylontech", "victron"] = key(
-        ..., "Layout of the frame with the SoC.", restart=True
-    )
+    profile: Literal["pylontech", "victron"] = key(..., "Layout of the frame with the SoC.")
     interface: str | None = key(
         None,
         "Driver of the inverter's bus, e.g. socketcan.",
         default_text="as without `interface`",
-        restart=True,
     )
-    channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.", restart=True)
+    channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.")
     bus_options: dict[str, StrictBool | int | float | str] = key(
-        {}, "Further arguments of its driver.", restart=True
+        {}, "Further arguments of its driver."
     )
 
 
@@ -177,8 +158,10 @@ def _none_for_auto(value: object) -> object:
     return value
 
 
-class RunConfig(Strict):
+class RunConfig(BaseModel):
     """Configuration of the service; each field describes itself."""
+
+    model_config = ConfigDict(**STRICT, frozen=True)
 
     model: str = key(..., "Model file of `cangauge fit`.", "-m, --model", "MODEL", is_path=True)
     interface: str | None = key(
@@ -348,10 +331,14 @@ class RunConfig(Strict):
         None, "Ask the battery controller for its replies over ISO-TP: the service then sends."
     )
     publish: PublishConfig | None = key(
-        None, "Hand the battery's frames on to an inverter, with the estimated SoC in them."
+        None,
+        "Hand the battery's frames on to an inverter, with the estimated SoC in them.",
+        restart=True,
     )
     judge: JudgeConfig | None = key(
-        None, "Judge the SoC that the battery itself publishes, at the end of each drive or charge."
+        None,
+        "Judge the SoC that the battery itself publishes, at the end of each drive or charge.",
+        restart=True,
     )
     http: str | None = key(
         None,
@@ -367,7 +354,9 @@ class RunConfig(Strict):
         restart=True,
         is_path=True,
     )
-    mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
+    mqtt: MqttConfig | None = key(
+        None, "MQTT broker that takes the state (extra `mqtt`).", restart=True
+    )
     dashboard: str | None = key(
         None,
         "Address of the live page (extra `live`). A port alone, such as 8642, serves this machine"
@@ -419,15 +408,6 @@ class RunConfig(Strict):
             ) from error
 
 
-_MAP_CURE: Final = "in the file of `map`; a map of three lines changes a preset (docs/map-file.md)"
-_IN_THE_MAP: Final = {
-    "messages": f"state [messages] {_MAP_CURE}",
-    "rules": f"state [rules] {_MAP_CURE}",
-    "checks": f"state those of [checks.current] under [current] {_MAP_CURE}",
-}
-"""Tables that a configuration could hold before, and where they are now."""
-
-
 def _as_key(option: re.Match[str]) -> str:
     return option[1].replace("-", "_") + " ="
 
@@ -443,8 +423,6 @@ def load_config(
     given = {name: value for name, value in (overrides or {}).items() if value not in (None, {})}
     _check_options(given)  # separately, so that an error names the source of the value
     data = {} if path is None else read_toml(path)
-    for name in _IN_THE_MAP.keys() & data:
-        raise InputError("belongs to the map file", source=path, field=name, cure=_IN_THE_MAP[name])
     validated(RunConfig, {"model": "-", **data}, path or "")
     for each in config_keys():
         *tables, name = each.name.split(".")
@@ -521,18 +499,22 @@ _BOUNDS: Final = {"exclusiveMinimum": ">", "minimum": "≥", "maximum": "≤"}
 def config_keys() -> tuple[ConfigKey, ...]:
     """Return all keys, from the JSON schema of the configuration."""
     schema = RunConfig.model_json_schema()
-    return tuple(_keys(schema, schema["$defs"], ""))
+    return tuple(_keys(schema, schema["$defs"]))
 
 
-def _keys(table: dict[str, Any], tables: dict[str, Any], prefix: str) -> Iterator[ConfigKey]:
+def _keys(
+    table: dict[str, Any], tables: dict[str, Any], prefix: str = "", *, restart: bool = False
+) -> Iterator[ConfigKey]:
     for name, field in table["properties"].items():
         # The type of an optional key is one of two; the other one is null.
         kind = field.get("anyOf", [field])[0]
         inner = tables.get(kind.get("$ref", "").rpartition("/")[2], {})
+        about = {"restart": restart} | kind.get("key", {}) | field.get("key", {})
         if "properties" in inner:
-            yield from _keys(inner, tables, f"{prefix}{name}.")
+            needs_restart = about["restart"]
+            yield from _keys(inner, tables, f"{prefix}{name}.", restart=needs_restart)
             continue
-        about, default = kind.get("key", {}) | field.get("key", {}), field.get("default")
+        default = field.get("default")
         if (text := about.pop("default_text", "")) or default is None or isinstance(default, dict):
             default = text
         elif isinstance(default, bool):

@@ -24,7 +24,7 @@ from cangauge.bus.time_source import frames_of_buses
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
-from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.compiled import PROGRESS_EVERY, make_estimator
 from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
@@ -42,8 +42,6 @@ from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
 from cangauge.settings import REPLAY_CLOCK_ID, FrameIds, TimeSourceName
 from cangauge.types import Estimate, Reason, Sample, reason_name, reason_sentences
 
-PROGRESS_EVERY: Final = 50_000
-"""Frames between two calls of the progress callback."""
 PACK_EVERY_S: Final = 1.0
 """Least interval of the rows of health, power and cells [s]."""
 PACK_ROWS: Final = 3600

@@ -12,10 +12,8 @@ from typing import Final
 
 import can
 
-from cangauge.bus.isotp import CONSECUTIVE, FIRST, PollTarget, Reassembler
+from cangauge.bus.isotp import CONSECUTIVE, FIRST, LONGEST_GAP_S, PollTarget, Reassembler
 
-REPLY_WITHIN_S: Final = 1.0
-"""Longest wait for the next frame of a reply [s]: N_Cr of ISO 15765-2."""
 EXCHANGE_WITHIN_S: Final = 5.0
 """Longest time from a request to its whole reply, also after "response pending" [s]: P2* of
 ISO 14229-2."""
@@ -83,7 +81,7 @@ class Poller:
         if now_s < max(self._next_s(target), self._quiet_until_s):
             return None
         self.asked_s[target.request_id] = now_s
-        self._awaited, self._give_up_s = target, now_s + REPLY_WITHIN_S
+        self._awaited, self._give_up_s = target, now_s + LONGEST_GAP_S
         self._exchange_ends_s, self._may_continue = now_s + EXCHANGE_WITHIN_S, True
         self._reassembler = Reassembler()
         self.counts["requests"] += 1
@@ -102,7 +100,7 @@ class Poller:
         if reply is None:
             kind = message.data[0] >> 4
             if kind in {FIRST, CONSECUTIVE}:
-                self._give_up_s = min(now_s + REPLY_WITHIN_S, self._exchange_ends_s)
+                self._give_up_s = min(now_s + LONGEST_GAP_S, self._exchange_ends_s)
             is_ours = kind == FIRST and message.data[2:].startswith(target.reply)
             if is_ours and self._may_continue:  # once: a node may repeat its first frame for ever
                 self._may_continue = False

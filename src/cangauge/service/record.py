@@ -31,7 +31,7 @@ from cangauge.bus.time_source import whole_us
 from cangauge.errors import InputError
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
-from cangauge.service.worker import Worker
+from cangauge.service.worker import CLOSE_WITHIN_S, Worker
 
 BATCH_FRAMES: Final = 256
 """Frames formatted at once: the thread holds the interpreter for 1 ms."""
@@ -39,10 +39,6 @@ BATCHES_WAITING: Final = 600
 """Batches that wait for a slow disk: over a minute at 2,000 frames/s, 30 MB."""
 SYNC_EVERY_S: Final = 30.0
 """Interval of fsync, against power cuts [s]."""
-CLOSE_WITHIN_S: Final = 0.6
-"""Time limit for writing what is left at the end [s]."""
-_RIGHTS: Final = 0o640
-"""Of a recording: the group may read where and how the car was driven, others not."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -213,7 +209,8 @@ class _RecordFile:
         self.close()
         # Made anew: another user may have made a file or a link of this name.
         flags = os.O_WRONLY | os.O_CLOEXEC | (0 if self._is_device else os.O_CREAT | os.O_EXCL)
-        self._descriptor = os.open(self.current, flags, _RIGHTS)
+        # The group may read where and how the car was driven, others not.
+        self._descriptor = os.open(self.current, flags, 0o640)
         self._part, self._bytes = part, 0
         self._text = io.StringIO(newline="")
         self._writer = can.CanutilsLogWriter(self._text)

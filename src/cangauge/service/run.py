@@ -58,8 +58,6 @@ class Service:
 
     Attributes
     ----------
-    config : RunConfig
-        The configuration in use, except for keys that need a restart.
     pipeline : Pipeline
         The estimator.
     recorder : Recorder or None
@@ -92,19 +90,24 @@ class Service:
             if isinstance(config, RunConfig)
             else partial(load_config, config, options)
         )
-        self.config = self._read()
-        with self.config.naming_keys():
-            self._state = state_path(self.config.state, os.environ)
-            self._check_files()
-            self._setup = setup = Setup.of(self.config)
+        config = self._read()
+        with config.naming_keys():
+            self._state = state_path(config.state, os.environ)
+            _check_files(config, self._state)
+            self._setup = setup = Setup.of(config)
             self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
-            self.address = address_of(self.config)
+            self.address = address_of(config)
         self.bus = str(self.address)
         self._outputs = list(outputs)
         self._is_stopped = self._is_reload_due = False
         self._reading: Future[Setup | CangaugeError] | None = None
         self.recorder: Recorder | None = None
         self.endpoint: Path | None = None
+
+    @property
+    def config(self) -> RunConfig:
+        """The configuration in use, except for keys that need a restart."""
+        return self._setup.config
 
     def stop(self) -> None:
         """Make `run` return; from any thread."""
@@ -205,7 +208,7 @@ class Service:
             emit(_LOG, logging.WARNING, "config.refused", text)
             return str(error)
         _log_changes(self._setup, new)
-        self._setup, self.config = new, new.config
+        self._setup = new
         return None
 
     def _poll_reload(self, monitor: Monitor) -> RunConfig | None:
@@ -253,20 +256,20 @@ class Service:
         if (path := status["recording"]) is not None:
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
 
-    def _check_files(self) -> None:
-        """Raise InputError if state or recording cannot be written, or if two files are one."""
-        config = self.config
-        for other in filter(None, (config.model, config.record, config.dbc, config.map)):
-            if self._state and os.path.realpath(other) == os.path.realpath(self._state):
-                raise InputError("is another file of this service", field="--state", value=other)
-        if self._state is not None:
-            check_writable(self._state)
-        if config.record is not None:
-            check_recording(Path(config.record), *_recording_limits(config))
-
 
 def _put_setup(read: Callable[[], RunConfig], into: Future[Setup | CangaugeError]) -> None:
     into.set_result(read_setup(read))
+
+
+def _check_files(config: RunConfig, state: Path | None) -> None:
+    """Raise InputError if state or recording cannot be written, or if two files are one."""
+    if state is not None:
+        for other in filter(None, (config.model, config.record, config.dbc, config.map)):
+            if os.path.realpath(other) == os.path.realpath(state):
+                raise InputError("is another file of this service", field="--state", value=other)
+        check_writable(state)
+    if config.record is not None:
+        check_recording(Path(config.record), *_recording_limits(config))
 
 
 def _recording_limits(config: RunConfig) -> list[float | None]:

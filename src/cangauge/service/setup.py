@@ -48,20 +48,16 @@ class Setup:
     def of(cls, config: RunConfig) -> Self:
         """Read all that a configuration names, without opening a bus; may raise InputError."""
         with config.naming_keys():
-            return cls._of(config)
-
-    @classmethod
-    def _of(cls, config: RunConfig) -> Self:
-        vehicle, model = load_vehicle(config), Model.load(config.model)
-        _check_poll(config, vehicle)
-        _check_publish(config)
-        outputs = tuple(
-            import_module(module).output_of(config, vehicle)
-            for module, keys in OUTPUTS.items()
-            if any(getattr(config, key) is not None for key in keys)
-        )
-        cure = _sign_cure(config, vehicle)
-        return cls(config, vehicle, model, pipeline_settings(config), cure, outputs)
+            vehicle, model = load_vehicle(config), Model.load(config.model)
+            _check_poll(config, vehicle)
+            _check_publish(config)
+            outputs = tuple(
+                import_module(module).output_of(config, vehicle)
+                for module, keys in OUTPUTS.items()
+                if any(getattr(config, key) is not None for key in keys)
+            )
+            cure = _sign_cure(config, vehicle)
+            return cls(config, vehicle, model, pipeline_settings(config), cure, outputs)
 
 
 def read_setup(read: Callable[[], RunConfig]) -> Setup | CangaugeError:
@@ -123,34 +119,34 @@ def inverter_address(publish: PublishConfig) -> BusAddress:
 
 def _check_publish(config: RunConfig) -> None:
     """Raise InputError if an inverter cannot be told the SoC."""
-    publish = config.publish
+    publish, problem = config.publish, ""
     if publish is None:
         return
-    channel, buses = publish.channel, (address_of(config), inverter_address(publish))
-    if str(buses[0]) == str(buses[1]):
+    buses, field, value = (address_of(config), inverter_address(publish)), "", ""
+    if config.time_source == "replay-clock":
+        field, value = "time_source", config.time_source
+        problem, cure = "the SoC of a replay is not the battery's", "remove it, or [publish]"
+    elif str(buses[0]) == str(buses[1]):
         problem = "is the battery's bus: a frame cannot be replaced on the bus that carries it"
         cure = "connect the inverter to a bus of its own"
-        raise InputError(
-            problem, source=config.file, field="publish.channel", value=channel, cure=cure
-        )
-    if any(bus.echoes for bus in buses):
+    elif any(bus.echoes for bus in buses):
         problem = "a bus returns the frames sent on it: they would go round for ever"
         cure = "use SocketCAN on both buses, and remove receive_own_messages"
+    if problem:
         raise InputError(
-            problem, source=config.file, field="publish.channel", value=channel, cure=cure
-        )
-    if config.time_source == "replay-clock":
-        problem, cure = "the SoC of a replay is not the battery's", "remove it, or [publish]"
-        raise InputError(
-            problem, source=config.file, field="time_source", value="replay-clock", cure=cure
+            problem,
+            source=config.file,
+            field=field or "publish.channel",
+            value=value or publish.channel,
+            cure=cure,
         )
 
 
 def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
     """Raise InputError if `[poll]` is given where nothing can be asked for."""
+    problem = ""
     if config.poll is None:
         return
-    problem = cure = ""
     if not vehicle.poll_targets:
         problem = f"no reply of the vehicle {vehicle.name} can be asked for"
         cure = (

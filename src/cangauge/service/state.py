@@ -34,7 +34,8 @@ from cangauge._text import duration, number
 from cangauge.errors import InputError
 from cangauge.estimation.state import EstimatorState
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.worker import Worker
+from cangauge.service.status import CLOCKS_APART_S
+from cangauge.service.worker import CLOSE_WITHIN_S, Worker
 
 STATE_FORMAT: Final = "cangauge-state"
 STATE_VERSION: Final = 6
@@ -43,12 +44,8 @@ LARGEST_BYTES: Final = 8 << 20
 """Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
 FILE_NAME: Final = "cangauge-state.json"
 """Name of the file in a folder."""
-CLOSE_WITHIN_S: Final = 0.7
-"""Time limit of the last write when the service ends [s]."""
 REBOOT_S: Final = 600.0
 """Least duration of a pause over a reboot [s]: the clock may have stopped with the machine."""
-FUTURE_S: Final = 60.0
-"""A state further in the future than this [s] has another clock: its age is unknown."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -202,7 +199,7 @@ class StateKeeper:
         if age_s > limit_s:
             text = f"{age_s / 3600.0:.1f} h old, more than the limit of {limit_s / 3600.0:g} h"
             raise InputError(text, source=path)
-        if age_s < -FUTURE_S:
+        if age_s < -CLOCKS_APART_S:
             return math.nan
         return max(age_s, REBOOT_S if content.boot_id != self._boot_id else 0.0)
 

@@ -40,13 +40,11 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 NOTIFY_EVERY_S: Final = 1.0
-"""Interval of status lines to systemd [s]."""
+"""Interval of status lines to systemd, and of health, power and cells in the snapshots [s]."""
 RATE_OVER_S: Final = 2.0
 """Averaging time of the sample rate [s]."""
 CLOCKS_APART_S: Final = 60.0
-"""A receive stamp further than this from the wall clock belongs to another clock [s]."""
-REPORT_EVERY_S: Final = 1.0
-"""Interval of health, power and cells in the snapshots [s]."""
+"""Stamps, or ages, further than this from the wall clock belong to another clock [s]."""
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
 """Counts of a bus to report, where it has them."""
 
@@ -202,7 +200,7 @@ class Monitor:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
         if samples and now_s >= self._report_due_s:
-            self._report_due_s = now_s + REPORT_EVERY_S
+            self._report_due_s = now_s + NOTIFY_EVERY_S
             self._report = pipeline.report().to_dict()
         statistics, settings = pipeline.decoder.statistics, pipeline.settings
         rejects = {name: getattr(statistics, name) for name in _REJECTS}

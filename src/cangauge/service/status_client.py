@@ -54,7 +54,6 @@ ANSWER_WITHIN_S: Final = 3.0
 LARGEST_ANSWER: Final = 1 << 20
 SEND_WITHIN_S: Final = 0.5
 """Longest wait for a client that does not read [s]; the next one waits as long."""
-SOCKET_MODE: Final = 0o660
 SYSTEM_FOLDER: Final = Path("/run/cangauge")
 """Folder of the systemd units, one subfolder for each service."""
 _LOG = logging.getLogger(__name__)
@@ -150,7 +149,7 @@ class StatusSocket:
                 path.unlink()
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             self._socket.bind(str(path))
-            path.chmod(SOCKET_MODE)
+            path.chmod(0o660)
             self._socket.listen(16)
         except OSError as error:
             raise InputError(

@@ -5,10 +5,14 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from typing import Final
 
 from cangauge.errors import CangaugeError
 
 Job = Callable[[], None]
+
+CLOSE_WITHIN_S: Final = 0.7
+"""Time limit of what is left to write when the service ends [s]."""
 
 
 def start_thread(run: Callable[[], object], name: str) -> threading.Thread:
