@@ -293,8 +293,8 @@ def _voltage(log: Log | CaptureSamples, table: EstimateTable, time: TimeFigures)
 
 def _input(log: Log | CaptureSamples, time: TimeFigures) -> list[Block]:
     current, temperature = [(log.time_s, log.current_a)], [(log.time_s, log.temperature_c)]
-    caption = f"Measured on: {log.temperature_source}. An estimate is valid only at temperatures"
-    caption += " that the model was identified at."
+    caption = f"Measured on: {log.temperature_source}. Outside the temperatures of the fit the SoC"
+    caption += " is less certain."
     return [
         time.channel("current", "A", current, BLUE, "Positive current discharges the pack."),
         time.channel("temperature", "°C", temperature, ORANGE, caption),
