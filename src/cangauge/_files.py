@@ -20,9 +20,10 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from copy import copy
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, Final, cast
+from typing import BinaryIO, Final, Self, cast
 
 from cangauge.errors import CangaugeError, InputError
 
@@ -181,6 +182,8 @@ class Head:
         The first 64 KiB.
     lines : tuple of str
         The first lines of a text, without line ends; empty for binary content.
+    text : bytes or None
+        What is read in place of the file's content.
 
     Raises
     ------
@@ -188,6 +191,8 @@ class Head:
         If the file is absent, unreadable, empty or damaged from its start, or if a zip holds
         several files.
     """
+
+    text: bytes | None = None
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.path = Path(path)
@@ -243,8 +248,16 @@ class Head:
         except (RuntimeError, NotImplementedError) as error:  # encrypted; unknown compression
             raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
 
+    def holding(self, text: bytes) -> Self:
+        """Return the head of a text that is read in place of the file's content."""
+        head = copy(self)
+        head.data, head.lines, head.text = text[:HEAD_BYTES], _lines(text[:HEAD_BYTES]), text
+        return head
+
     def read(self) -> bytes:
         """Return the unpacked content; InputError if damaged, or larger than a log may be."""
+        if self.text is not None:
+            return self.text
         with self.open() as file:
             return read_all(file, self.path, MAX_LOG_BYTES, "a log")
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import islice, product
 from typing import Final
 
-from cangauge._files import Head
 from cangauge.errors import InputError
 from cangauge.logs.column_map import DOCS, ColumnMap
 from cangauge.logs.columns import NEEDED, UnknownColumnsError
@@ -17,20 +16,6 @@ _TRIALS: Final = 24
 
 _Likely = Mapping[str, Sequence[str]]
 """Likely columns of each quantity, as texts of `--columns`."""
-
-
-class Beginning(Head):
-    """The whole lines of a file's beginning, on which a proposal is tried."""
-
-    def __init__(self, head: Head) -> None:
-        self.path = head.path
-        self.name = head.name
-        self.data = head.data[: head.data.rfind(b"\n") + 1]
-        self.lines = head.lines
-
-    def read(self) -> bytes:
-        """Return the beginning of the content."""
-        return self.data
 
 
 def proposing(error: UnknownColumnsError, reads: Callable[[ColumnMap], bool]) -> InputError:

@@ -22,7 +22,7 @@ from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
-from cangauge.logs.proposals import Beginning, proposing
+from cangauge.logs.proposals import proposing
 from cangauge.logs.quantities import FIELDS
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
@@ -159,7 +159,8 @@ class LogFile:
 
     def reads(self, reader: LogReader, columns: ColumnMap) -> bool:
         """Return whether a reader makes a log of the file's beginning by these columns."""
-        head = Beginning(self.head) if self.head.lines else self.head
+        head, whole_lines = self.head, self.head.data.rpartition(b"\n")[:2]
+        head = head.holding(b"".join(whole_lines)) if head.lines else head
         constant_c = None if "temperature" in columns.texts else 20.0
         try:
             draft = reader.read(head, columns)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import product
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -52,40 +52,6 @@ def _find(columns: Sequence[_Column], patterns: Sequence[str]) -> _Column | None
     return next(matches, None)
 
 
-class _Cells:
-    """The wanted columns of an export, read, and the draft that they fill."""
-
-    def __init__(self, table: TextTable, wanted: dict[str, _Column]) -> None:
-        self._cells = table.columns([column.place for column in wanted.values()])
-        self._found = f"found: {shown_headings(table.headings)}"
-        self.wanted = wanted
-        self.draft = DraftLog(table.head.name, str(table.head.path), remarks=[*table.remarks])
-
-    def values(self, name: str, quantity: str) -> FloatArray:
-        """Return a column in the canonical unit, with a remark if it is converted."""
-        column, source = self.wanted[name], self.draft.source
-        numbers, _ = numbers_of(self._cells[column.place], source, column.text)
-        values = convert(numbers, quantity, column.unit, source=source, label=column.text)
-        if values is not numbers:
-            self.draft.remarks.append(f"{column.text}: converted from {column.unit} to {quantity}")
-        return values
-
-    def take(self, quantity: str, name: str, values: FloatArray) -> None:
-        self.draft.values[quantity] = values
-        self.draft.labels[quantity] = self.wanted[name].text
-
-    def require(self, *quantities: str) -> None:
-        for quantity in quantities:
-            if quantity not in self.draft.values:
-                problem = f"no column of this file holds it ({self._found})"
-                cure = "check the export, or convert it to a canonical log"
-                raise InputError(problem, source=self.draft.source, field=quantity, cure=cure)
-
-    def says_yes(self, name: str) -> Any:
-        yes = pc.equal(pc.utf8_trim_whitespace(self._cells[self.wanted[name].place]), "Yes")
-        return np.asarray(pc.fill_null(yes, fill_value=False), dtype=bool)
-
-
 @dataclass(frozen=True, slots=True)
 class Export:
     """A text whose format defines columns, units and sign.
@@ -97,7 +63,9 @@ class Export:
     known_by : tuple of str
         Regular expressions, each of which matches a heading (in lower case) of such a file.
     columns : dict
-        Regular expressions of a quantity's headings, the preferred first.
+        Regular expressions of the headings of time and SoC, the preferred first.
+    instruments : dict
+        Those of current and voltage by the instrument that measures both, the preferred first.
     delimiter : str
     charges : bool
         Positive current charges.
@@ -110,11 +78,14 @@ class Export:
         +25 °C, `_N05_`: −5 °C; `HPPC-40C`: 40 °C; `2C-Discharge` is a rate).
     bare : str
         Header of files that have none; they mark rows to `exclude`.
+    waits : bool
+        Rows before time 0 are of the wait before the test.
     """
 
     name: str
     known_by: tuple[str, ...]
-    columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    columns: dict[str, tuple[str, ...]]
+    instruments: dict[str, tuple[str, str]]
     delimiter: str = ","
     charges: bool = True
     source: TemperatureSource = "cell"
@@ -122,6 +93,7 @@ class Export:
     ambient: str = "(?!)"
     set_point: str = "(?!)"
     bare: str = ""
+    waits: bool = False
     takes_columns = False
 
     def matches(self, head: Head) -> bool:
@@ -144,131 +116,146 @@ class Export:
         return None
 
     def read(self, head: Head, _given: ColumnMap | None = None, /) -> DraftLog:
-        """Read an export."""
+        """Read an export.
+
+        Raises
+        ------
+        InputError
+            If a column is missing, or holds anything but numbers.
+        """
         header, skip_lines = self._header(head) or ([], 0)
         columns = _columns(header)
-        more = {"ambient": (self.ambient,), "exclude": ("exclude",) if self.bare else ()}
-        wanted = {
-            name: column
-            for name, patterns in (self.columns | more).items()
-            if (column := _find(columns, patterns)) is not None
+        named = {name: _find(columns, patterns) for name, patterns in self.columns.items()}
+        ambient = _find(columns, (self.ambient,))
+        exclude = _find(columns, ("exclude",)) if self.bare else None
+        pairs = {
+            instrument: {
+                quantity: column
+                for quantity, pattern in zip(_DRIVING, patterns, strict=True)
+                if (column := _find(columns, (pattern,))) is not None
+            }
+            for instrument, patterns in self.instruments.items()
         }
         sensors = [column for column in columns if re.fullmatch(self.sensors, column.simple)]
-        wanted |= {column.text: column for column in sensors}
+        wanted = [*named.values(), ambient, exclude, *sensors]
+        wanted += [column for pair in pairs.values() for column in pair.values()]
         table = TextTable(head, self.delimiter, header, (), skip_lines, [])
-        cells = _Cells(table, wanted)
-        cells.draft.remarks.insert(0, f"{self.name} export")
-        self._take(cells)
-        self._take_temperature(cells, head.path.name, [column.text for column in sensors])
-        self._drop(cells)
-        return cells.draft
-
-    def _take(self, cells: _Cells) -> None:
-        """Take all but the temperature."""
-        for quantity in (*REQUIRED[:3], "soc_pct"):
-            if quantity in cells.wanted:
-                cells.take(quantity, quantity, cells.values(quantity, quantity))
-        cells.require(*REQUIRED[:3])
+        cells = table.columns([column.place for column in wanted if column is not None])
+        draft = DraftLog(head.name, str(head.path))
+        draft.remarks += [f"{self.name} export", *table.remarks]
+        for quantity, column in named.items():
+            if column is not None:
+                _take(draft, quantity, column, _values(draft, cells, column, quantity))
+        _take_pair(draft, cells, pairs)
+        for quantity in REQUIRED[:3]:
+            if quantity not in draft.values:
+                problem = f"no column of this file holds it (found: {shown_headings(header)})"
+                cure = "check the export, or convert it to a canonical log"
+                raise InputError(problem, source=draft.source, field=quantity, cure=cure)
         if self.charges:
-            cells.draft.negate_current(f"{self.name} stores discharge as negative")
+            draft.negate_current(f"{self.name} stores discharge as negative")
+        self._take_temperature(draft, cells, sensors, ambient)
+        if exclude is not None:
+            yes = pc.equal(pc.utf8_trim_whitespace(cells[exclude.place]), "Yes")
+            is_excluded = np.asarray(pc.fill_null(yes, fill_value=False), dtype=bool)
+            draft.keep(~is_excluded, "that the cycler excludes dropped")
+        if self.waits:
+            waiting = draft.values["time_s"] < 0.0
+            if waiting.all():
+                problem, label = "all rows are before time 0", draft.labels["time_s"]
+                raise InputError(problem, source=draft.source, field=label, cure="check the export")
+            draft.keep(~waiting, "before time 0 (the wait before the test) dropped")
+        return draft
 
-    def _drop(self, cells: _Cells) -> None:
-        """Drop rows that are not of the test."""
-        if "exclude" in cells.wanted:
-            cells.draft.keep(~cells.says_yes("exclude"), "that the cycler excludes dropped")
-
-    def _take_temperature(self, cells: _Cells, file_name: str, sensors: Sequence[str]) -> None:
+    def _take_temperature(
+        self,
+        draft: DraftLog,
+        cells: dict[int, Any],
+        sensors: Sequence[_Column],
+        ambient: _Column | None,
+    ) -> None:
         """Take the sensors, else the room's temperature or the set point, if any."""
-        draft = cells.draft
-        probes = {name: cells.values(name, "temperature_c") for name in sensors}
-        probes = {name: each for name, each in probes.items() if np.isfinite(each).any()}
+        name = "temperature_c"
+        probes = {each.text: _values(draft, cells, each, name) for each in sensors}
+        probes = {text: each for text, each in probes.items() if np.isfinite(each).any()}
         if probes:
             draft.take_probes([*probes], [*probes.values()])
-            draft.labels["temperature_c"] = next(iter(probes))
+            draft.labels[name] = next(iter(probes))
             draft.temperature_source = self.source
             if len(probes) > 1:
                 draft.remarks.append(f"temperature: median of {len(probes)} columns")
-        elif "ambient" in cells.wanted:
-            cells.take("temperature_c", "ambient", cells.values("ambient", "temperature_c"))
+        elif ambient is not None:
+            _take(draft, name, ambient, _values(draft, cells, ambient, name))
             draft.temperature_source = "room"
             draft.remarks.append("temperature: the room's, not the battery's")
-        found = list(re.finditer(self.set_point, file_name, re.IGNORECASE))
+        found = list(re.finditer(self.set_point, Path(draft.source).name, re.IGNORECASE))
         if len(found) == 1 and not sensors:
             groups = found[0].groupdict()
             value_c = float(groups["value"]) * (-1.0 if groups.get("sign") == "N" else 1.0)
-            draft.values["temperature_c"] = np.full(draft.values["time_s"].size, value_c)
+            draft.values[name] = np.full(draft.values["time_s"].size, value_c)
             draft.temperature_source = "room"
             shown = f"temperature {value_c:g} °C from the file name: the chamber's set point"
             draft.remarks.append(shown)
 
 
-_CAN: Final = "car's CAN"
-_INSTRUMENTS: Final = {
-    "500 A clamp": r"hvbattery{0}w/?500amaxclamp",
-    "200 A clamp": r"hvbattery{0}w/?200amaxclamp",
-    "HV battery channels": "hvbattery{0}",
-    "power analyser": r"hvbatt{1}hioki\w*",
-    _CAN: r"hvbatt(ery)?({0}|{1})\w*can\d*",
-}
-"""D3's channels, the preferred first: instruments before copies from CAN."""
-_WORDS: Final = {"current_a": ("current", "curr"), "voltage_v": ("voltage", "volt")}
+def _take(draft: DraftLog, quantity: str, column: _Column, values: FloatArray) -> None:
+    draft.values[quantity] = values
+    draft.labels[quantity] = column.text
 
 
-@dataclass(frozen=True, slots=True)
-class D3Test(Export):
-    """A 10 Hz test of Argonne's Downloadable Dynamometer Database: tab-separated text.
+def _values(draft: DraftLog, cells: dict[int, Any], column: _Column, quantity: str) -> FloatArray:
+    """Return a column in the canonical unit, with a remark if it is converted."""
+    numbers, _ = numbers_of(cells[column.place], draft.source, column.text)
+    values = convert(numbers, quantity, column.unit, source=draft.source, label=column.text)
+    if values is not numbers:
+        draft.remarks.append(f"{column.text}: converted from {column.unit} to {quantity}")
+    return values
 
-    Headings differ between years. Positive current discharges; a copy from the car's CAN may have
-    the opposite sign, which is then found from the data. `Cell Temp` is the temperature of the
-    test room. Rows before time 0 (the wait before the test) are dropped.
-    """
 
-    def _take(self, cells: _Cells) -> None:
-        """Take time, SoC, and current and voltage of the first instrument that has both."""
-        draft = cells.draft
-        for quantity in ("time_s", "soc_pct"):
-            if quantity in cells.wanted:
-                cells.take(quantity, quantity, cells.values(quantity, quantity))
-        cells.require("time_s")
-        taken: dict[str, tuple[str, FloatArray]] = {}
-        for instrument in _INSTRUMENTS:
-            own = {}
-            for quantity in _WORDS:
-                name = f"{instrument} {quantity}"
-                if name not in cells.wanted:
-                    continue
-                values = cells.values(name, quantity)
-                if np.isfinite(values).any():
-                    own[quantity] = instrument, values
-                else:
-                    draft.remarks.append(f"{cells.wanted[name].text} is empty and was not used")
-            taken = own if len(own) == len(_WORDS) else {**own, **taken}
-            if len(own) == len(_WORDS):
-                break
-        for quantity, (instrument, values) in sorted(taken.items()):
-            cells.take(quantity, f"{instrument} {quantity}", values)
+def _take_pair(
+    draft: DraftLog, cells: dict[int, Any], pairs: dict[str, dict[str, _Column]]
+) -> None:
+    """Take current and voltage of the first instrument that has both."""
+    taken: dict[str, tuple[str, _Column, FloatArray]] = {}
+    for instrument, pair in pairs.items():
+        own = {}
+        for quantity, column in pair.items():
+            values = _values(draft, cells, column, quantity)
+            if instrument and not np.isfinite(values).any():
+                draft.remarks.append(f"{column.text} is empty and was not used")
+            else:
+                own[quantity] = instrument, column, values
+        taken = {**taken, **own} if len(own) == len(_DRIVING) else {**own, **taken}
+        if len(own) == len(_DRIVING):
+            break
+    for quantity, (instrument, column, values) in sorted(taken.items()):
+        _take(draft, quantity, column, values)
+        if instrument:
             draft.remarks.append(f"{quantity} from the {instrument}")
-            draft.sign_unknown |= quantity == "current_a" and instrument == _CAN
-        cells.require("current_a", "voltage_v")
+        draft.sign_unknown |= quantity == "current_a" and instrument == _CAN
 
-    def _drop(self, cells: _Cells) -> None:
-        """Drop the wait before the test."""
-        draft = cells.draft
-        waiting = draft.values["time_s"] < 0.0
-        if waiting.all():
-            problem, label = "all rows are before time 0", draft.labels["time_s"]
-            raise InputError(problem, source=draft.source, field=label, cure="check the export")
-        draft.keep(~waiting, "before time 0 (the wait before the test) dropped")
+
+_DRIVING: Final = REQUIRED[1:3]
+_CAN: Final = "car's CAN"
+# D3's channels, the preferred first: instruments before copies from CAN.
+_INSTRUMENTS: Final = {
+    instrument: (pattern.format("current", "curr"), pattern.format("voltage", "volt"))
+    for instrument, pattern in {
+        "500 A clamp": r"hvbattery{0}w/?500amaxclamp",
+        "200 A clamp": r"hvbattery{0}w/?200amaxclamp",
+        "HV battery channels": "hvbattery{0}",
+        "power analyser": r"hvbatt{1}hioki\w*",
+        _CAN: r"hvbatt(ery)?({0}|{1})\w*can\d*",
+    }.items()
+}
 
 
 def _cycler(name: str, time: str, current: str, voltage: str, *more: str, **how: Any) -> Export:
     """Return a cycler's export by its headings, in lower case."""
     headings = time, current, voltage
-    columns: dict[str, tuple[str, ...]] = {
-        quantity: (re.escape(re.sub(r"[\s_]", "", heading)),)
-        for quantity, heading in zip(REQUIRED, headings, strict=False)
-    }
-    return Export(name, tuple(map(re.escape, (*headings, *more))), columns, **how)
+    simple = [re.escape(re.sub(r"[\s_]", "", heading)) for heading in headings]
+    known_by = tuple(map(re.escape, (*headings, *more)))
+    return Export(name, known_by, {"time_s": (simple[0],)}, {"": (simple[1], simple[2])}, **how)
 
 
 _SIGNED: Final = r"_(?P<sign>[NP])(?P<value>\d\d)(?=[_.])"
@@ -278,31 +265,27 @@ READERS: Final = (
     Export(
         "BMW i3",
         (r"time \[s\]", r"battery voltage \[.*"),
-        {
-            "time_s": ("time",),
-            "current_a": ("batterycurrent",),
-            "voltage_v": ("batteryvoltage",),
-            "soc_pct": ("soc",),
-        },
+        {"time_s": ("time",), "soc_pct": ("soc",)},
+        {"": ("batterycurrent", "batteryvoltage")},
         delimiter=";",
         sensors="batterytemperature",
         source="pack",
     ),
-    D3Test(
+    # A 10 Hz test of Argonne's Downloadable Dynamometer Database. Headings differ between years.
+    # Positive current discharges; a copy from the car's CAN may have the opposite sign, which is
+    # then found from the data. `Cell Temp` is the temperature of the test room.
+    Export(
         "ANL D3",
         (r"(daq[ _]?)?time(stamp)?\s*(\[.*|__.*)?", "(hv[ _]?batt|dyno).*"),
         {
             "time_s": (r"time(stamp)?", "daqtime"),
             "soc_pct": ("hvbatterysoc", r"hvbatt(ery)?soc(can\d*)?"),
-            **{
-                f"{instrument} {quantity}": (pattern.format(*words),)
-                for (instrument, pattern), (quantity, words) in product(
-                    _INSTRUMENTS.items(), _WORDS.items()
-                )
-            },
         },
+        _INSTRUMENTS,
         delimiter="\t",
+        charges=False,
         ambient=r"(test)?celltemp(erature)?",
+        waits=True,
     ),
     _cycler(
         "Arbin",

@@ -23,10 +23,16 @@ VOLTAGE_FILL_S: Final = 1.0
 """Longest time between two values of a channel for interpolation [s], as in captures."""
 
 
-class _Signals(Channels):
-    """The signals of an open MF4, each on its own raster; `places` are group and index by name."""
+class Mf4Signals(Channels):
+    """MF4 with signals, as CANape and INCA write them; one with bus logging is a capture.
 
+    An instance is an open file; `places` are group and index of each signal by its name.
+    """
+
+    takes_columns = True
     time = "time [s]"
+    _BUS_LOGGING: Final = b"CAN_DataFrame"
+    """Channel name of the standard for bus logging, stored uncompressed."""
 
     def __init__(self, file: Any, places: dict[str, tuple[int, int]], source: Path) -> None:
         self._file, self._places, self._source = file, places, source
@@ -76,27 +82,21 @@ class _Signals(Channels):
         filled[(after - before > VOLTAGE_FILL_S) & (before != rows_s)] = np.nan
         return filled
 
-
-class Mf4Signals:
-    """MF4 with signals, as CANape and INCA write them; one with bus logging is a capture."""
-
-    takes_columns = True
-    _BUS_LOGGING: Final = b"CAN_DataFrame"
-    """Channel name of the standard for bus logging, stored uncompressed."""
-
-    def matches(self, head: Head) -> bool:
+    @classmethod
+    def matches(cls, head: Head) -> bool:
         """Return whether the file is an MF4 without bus logging."""
         if not head.data.startswith((b"MDF     ", b"UnFinMF ")):
             return False
         tail = b""
         with head.open() as file:
             while part := file.read(MIB):
-                if self._BUS_LOGGING in tail + part:
+                if cls._BUS_LOGGING in tail + part:
                     return False
-                tail = part[-len(self._BUS_LOGGING) :]
+                tail = part[-len(cls._BUS_LOGGING) :]
         return True
 
-    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
+    @classmethod
+    def read(cls, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read the chosen signals.
 
         Raises
@@ -112,8 +112,8 @@ class Mf4Signals:
             ) from error
         try:
             with head.open() as unpacked, MDF(unpacked) as file:
-                places = self._places(file)
-                draft = _Signals(file, places, head.path).draft(head, columns)
+                places = cls._places_in(file)
+                draft = cls(file, places, head.path).draft(head, columns)
         except InputError:
             raise
         except Exception as error:  # asammdf raises whatever a damaged block provokes
@@ -126,7 +126,7 @@ class Mf4Signals:
         return draft
 
     @staticmethod
-    def _places(file: Any) -> dict[str, tuple[int, int]]:
+    def _places_in(file: Any) -> dict[str, tuple[int, int]]:
         """Return group and index by heading; of channels with one name, that of most values."""
         places: dict[str, tuple[int, int]] = {}
         counts: dict[str, int] = {}
@@ -143,4 +143,4 @@ class Mf4Signals:
         return places
 
 
-READERS: Final = (Mf4Signals(),)
+READERS: Final = (Mf4Signals,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 from operator import itemgetter
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -51,17 +51,6 @@ class Workbook:
         InputError
             If openpyxl is not installed, or the workbook is damaged or holds no log.
         """
-        sheet = _SheetText(head)
-        draft = LogTableReader().read(sheet, columns)
-        draft.remarks.extend(sheet.remarks)
-        return draft
-
-
-class _SheetText(Head):
-    """The text of a workbook's sheet in place of the file's content."""
-
-    def __init__(self, head: Head) -> None:
-        self.path, self.name = head.path, head.name
         sheets = _sheets(head)
         rows = max(sheets.values(), key=len, default=[])
         longest = next((title for title, each in sheets.items() if each is rows), "")
@@ -70,14 +59,11 @@ class _SheetText(Head):
             for title, each in sheets.items()
             if each and title != longest
         ]
-        remark = f"sheet {longest!r} is read, the longest; not read: {', '.join(others)}"
-        self.remarks = [remark] if others else []
-        self._text = "\n".join([*rows, ""]).encode()
-        self.data = self._text[: 1 << 16]
-        self.lines = tuple(self.data.decode(errors="ignore").splitlines()[:160])
-
-    def read(self) -> bytes:
-        return self._text
+        draft = LogTableReader().read(head.holding("\n".join([*rows, ""]).encode()), columns)
+        if others:
+            remark = f"sheet {longest!r} is read, the longest; not read: {', '.join(others)}"
+            draft.remarks.append(remark)
+        return draft
 
 
 def _sheets(head: Head) -> dict[str, list[str]]:
@@ -111,14 +97,18 @@ def _rows(sheet: Any) -> list[str]:
     return [line for line in islice(lines, MAX_ROWS) if line.strip()]
 
 
-class LongTable:
+class LongTable(Channels):
     """A row per value: a name, a value and a time, pivoted on time; the names are the headings.
 
     Car Scanner (`PID`, `VALUE`), InfluxDB (`_field`, `_value`), Home Assistant (`entity_id`,
     `state`). Some store a value when it changes, others whenever they ask for it.
+
+    An instance holds times [s] and values of each series, in the order of time. `label` is the
+    heading of the times, `how` their reading, `names` the heading of the series' names.
     """
 
     takes_columns = True
+    time = "time"
     _NAMES: Final = (
         *("pid", "entity_id", "_measurement", "_field", "field", "name", "signal", "channel"),
         *("sensor", "parameter", "variable", "metric", "topic", "key", "series", "tag"),
@@ -126,16 +116,28 @@ class LongTable:
     _VALUES: Final = ("value", "_value", "state", "payload", "val")
     _UNITS: Final = frozenset({"unit", "units", "unit_of_measurement"})
 
-    def matches(self, head: Head) -> bool:
-        """Return whether the header has a name, a value and a time."""
-        return self._text(head) is not None
+    def __init__(
+        self, names: str, label: str, how: str, by_name: dict[str, tuple[FloatArray, FloatArray]]
+    ) -> None:
+        self.label, self.how, self._by_name = label, how, by_name
+        repeats = [np.diff(values) == 0.0 for _, values in by_name.values()]
+        self._is_polled = bool(np.mean(np.concatenate(repeats)) > POLLED_SHARE)
+        each = "the current" if self._is_polled else "current and voltage, which are held"
+        pivoted = f"{len(by_name)} series of {names} pivoted on time"
+        self.remarks = [f"a row per value: {pivoted}; a row for each value of {each}"]
 
-    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
+    @classmethod
+    def matches(cls, head: Head) -> bool:
+        """Return whether the header has a name, a value and a time."""
+        return cls._text(head) is not None
+
+    @classmethod
+    def read(cls, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read the values: a row for each current, or for each change."""
-        text = self._text(head)
+        text = cls._text(head)
         if text is None:
             raise InputError("no header with a name, a value and a time", source=head.path)
-        series = self._series(text)
+        series = cls._series(text)
         draft = series.draft(head, columns)
         known = np.isfinite(draft.values["current_a"] + draft.values["voltage_v"])
         draft.values = {name: values[known] for name, values in draft.values.items()}
@@ -143,20 +145,22 @@ class LongTable:
         draft.labels["time_s"] = series.label
         return draft
 
-    def _text(self, head: Head) -> TextTable | None:
+    @classmethod
+    def _text(cls, head: Head) -> TextTable | None:
         """Return the table of values; None where a row holds all quantities of one time."""
         for text in headed(head, rows=1):
             lower = {cell.lower() for cell in text.headings}
-            is_long = lower.intersection(self._NAMES) and lower.intersection(self._VALUES)
+            is_long = lower.intersection(cls._NAMES) and lower.intersection(cls._VALUES)
             if is_long and not choose_columns(text.headings).is_complete and _time_of(text):
                 return text
         return None
 
-    def _series(self, text: TextTable) -> _Series:
+    @classmethod
+    def _series(cls, text: TextTable) -> Self:
         lower = [cell.lower() for cell in text.headings]
-        value = next(lower.index(name) for name in self._VALUES if name in lower)
-        named = [place for place, name in enumerate(lower) if name in self._NAMES]
-        units = [place for place, name in enumerate(lower) if name in self._UNITS]
+        value = next(lower.index(name) for name in cls._VALUES if name in lower)
+        named = [place for place, name in enumerate(lower) if name in cls._NAMES]
+        units = [place for place, name in enumerate(lower) if name in cls._UNITS]
         time = text.headings.index(_time_of(text))
         cells = text.columns([0, value, time, *named, *units])
         # Words ("unavailable") end a value. Headers and InfluxDB's notes stand above each table.
@@ -181,42 +185,9 @@ class LongTable:
         if np.max(stamps, initial=0.0) < DAY_S:  # seconds of the day
             stamps = over_midnight(stamps)
         label_of_names = " and ".join(text.headings[place] for place in varying)
-        return _Series(
+        return cls(
             label_of_names, label, how, _by_name(names, stamps, values.filter(known).to_numpy())
         )
-
-
-def _by_name(
-    names: Any, stamps_s: FloatArray, values: FloatArray
-) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return times and values of each series, in the order of time."""
-    order = np.argsort(stamps_s, kind="stable")
-    codes = names.indices.to_numpy()[order]
-    order = order[np.argsort(codes, kind="stable")]
-    ends = np.cumsum(np.bincount(codes))
-    parts = zip(np.split(stamps_s[order], ends), np.split(values[order], ends), strict=True)
-    named = zip(names.dictionary.to_pylist(), parts, strict=False)  # the last part is empty
-    return {name: part for name, part in named if name and np.isfinite(part[1]).any()}
-
-
-class _Series(Channels):
-    """Times [s] and values of each series of a long table, in the order of time.
-
-    `label` is the heading of the times, `how` their reading, `names` the heading of the series'
-    names.
-    """
-
-    time = "time"
-
-    def __init__(
-        self, names: str, label: str, how: str, by_name: dict[str, tuple[FloatArray, FloatArray]]
-    ) -> None:
-        self.label, self.how, self._by_name = label, how, by_name
-        repeats = [np.diff(values) == 0.0 for _, values in by_name.values()]
-        self._is_polled = bool(np.mean(np.concatenate(repeats)) > POLLED_SHARE)
-        each = "the current" if self._is_polled else "current and voltage, which are held"
-        pivoted = f"{len(by_name)} series of {names} pivoted on time"
-        self.remarks = [f"a row per value: {pivoted}; a row for each value of {each}"]
 
     @property
     def headings(self) -> list[str]:
@@ -273,6 +244,19 @@ class _Series(Channels):
         return np.where(is_near | (not is_driving), values[place], np.nan)
 
 
+def _by_name(
+    names: Any, stamps_s: FloatArray, values: FloatArray
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return times and values of each series, in the order of time."""
+    order = np.argsort(stamps_s, kind="stable")
+    codes = names.indices.to_numpy()[order]
+    order = order[np.argsort(codes, kind="stable")]
+    ends = np.cumsum(np.bincount(codes))
+    parts = zip(np.split(stamps_s[order], ends), np.split(values[order], ends), strict=True)
+    named = zip(names.dictionary.to_pylist(), parts, strict=False)  # the last part is empty
+    return {name: part for name, part in named if name and np.isfinite(part[1]).any()}
+
+
 def _time_of(text: TextTable) -> str:
     """Return the most direct heading of time, "" without any."""
     meanings = [(meaning_of(heading), heading) for heading in text.headings]
@@ -293,4 +277,4 @@ def _as_numbers(cells: Any) -> Any:
     return pc.fill_null(pc.cast(numbers, pa.float64()), float("nan")).combine_chunks()
 
 
-READERS: Final = (Workbook(), LongTable())
+READERS: Final = (Workbook(), LongTable)
