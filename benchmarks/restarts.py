@@ -38,7 +38,7 @@ from rich.table import Table
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress, open_bus
-from cangauge.bus.publish import SocEstimate, SocReader
+from cangauge.bus.publish import SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
@@ -330,9 +330,9 @@ class Player(threading.Thread):
 
     def _read(self, message: can.Message) -> None:
         for frame_id, reader in zip((KILLED_ID, WHOLE_ID), self._readers, strict=True):
-            content = reader.read(message)
-            if isinstance(content, SocEstimate) and not content.reasons & Reason.INPUT_STALE:
-                self._latest[frame_id] = content.soc_pct
+            name, content = reader.read(message)
+            if name == "soc_estimate" and not content["reason"] & Reason.INPUT_STALE:
+                self._latest[frame_id] = content["soc_pct"]
 
     def forget(self) -> None:
         """Drop the SoC of the killed service."""

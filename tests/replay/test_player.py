@@ -257,7 +257,7 @@ def test_recorded_timing_is_kept(
     caught_up = np.array(times) - times[0] > late_s + 0.02
     assert np.abs(late[caught_up]).max() < 2e-3  # a late frame does not delay the rest
     assert state.log_seconds == pytest.approx(times[-1] - times[0], abs=1e-6)
-    assert (state.acknowledged, state.soc) == (None, None)
+    assert (state.acknowledged, state.soc) == (None, {})
 
 
 def test_a_long_wait_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:

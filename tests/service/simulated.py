@@ -11,7 +11,7 @@ import can
 import pytest
 
 from cangauge.bus.open import BusAddress
-from cangauge.bus.publish import SocEstimate, SocReader
+from cangauge.bus.publish import SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.encoder import FrameEncoder
@@ -26,6 +26,14 @@ BEGAN_S = 5000.0
 EPOCH_S = 1.7e9
 GIVEN = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
 """A start: drives of seconds have no block of voltages."""
+
+
+def estimate_in(reader: SocReader, frame: can.Message) -> SimpleNamespace | None:
+    """Return the values of a SOC_ESTIMATE; None for other frames."""
+    name, values = reader.read(frame)
+    if name != "soc_estimate":
+        return None
+    return SimpleNamespace(**values, reasons=values["reason"])
 
 
 class SimulatedPort:
@@ -75,10 +83,11 @@ class SimulatedPort:
         pass
 
     @property
-    def published(self) -> list[tuple[float, SocEstimate]]:
+    def published(self) -> list[tuple[float, SimpleNamespace]]:
+        """The values of each SOC_ESTIMATE, and when it was sent [s]."""
         reader = SocReader()
-        read = [(at_s, reader.read(frame)) for at_s, frame in self.sent]
-        return [(at_s, content) for at_s, content in read if isinstance(content, SocEstimate)]
+        read = [(at_s, estimate_in(reader, frame)) for at_s, frame in self.sent]
+        return [(at_s, values) for at_s, values in read if values is not None]
 
 
 def frames_every(

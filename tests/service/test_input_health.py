@@ -8,12 +8,14 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 
 import can
 import pytest
+from simulated import estimate_in
 
 from cangauge.bus.protection import GENERIC_RULE
-from cangauge.bus.publish import SocEstimate, SocReader
+from cangauge.bus.publish import SocReader
 from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -77,10 +79,10 @@ class Result:
 
     samples: list[Sample]
     estimates: list[Estimate]
-    published: dict[float, SocEstimate]
+    published: dict[float, SimpleNamespace]
     pipeline: Pipeline
 
-    def published_at(self, time_s: float) -> SocEstimate:
+    def published_at(self, time_s: float) -> SimpleNamespace:
         return self.published[min(self.published, key=lambda each: abs(each - time_s))]
 
 
@@ -97,8 +99,8 @@ def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Resul
             result.estimates.append(pipeline.latest)
         if frame.timestamp == next_s:
             continue
-        published = reader.read(pipeline.heartbeat()[0])
-        assert isinstance(published, SocEstimate)
+        published = estimate_in(reader, pipeline.heartbeat()[0])
+        assert published is not None
         result.published[frame.timestamp] = published
     return result
 

@@ -6,7 +6,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.publish import ACKNOWLEDGE_EVERY, SocDetail, SocReader
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, SocReader
 from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -78,8 +78,8 @@ def test_samples_of_a_replay_are_acknowledged_while_they_come(log: Log) -> None:
     reader, told = SocReader(), [0]
     for frame in with_clock(frames_of(log.rows(slice(0, 100)), vehicle)):
         for sent in pipeline.acknowledgement(pipeline.latest) if pipeline.handle(frame) else []:
-            content = reader.read(sent)
-            told += [content.samples] if isinstance(content, SocDetail) else []
+            name, content = reader.read(sent)
+            told += [content["samples"]] if name == "soc_detail" else []
         assert pipeline.samples - told[-1] < ACKNOWLEDGE_EVERY
     assert told == sorted(told)
 

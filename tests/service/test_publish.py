@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
-from cangauge.bus.publish import PackReport, SocEstimate, SocPublisher, SocReader
+from cangauge.bus.publish import PackReport, SocPublisher, SocReader
 from cangauge.errors import InputError
 from cangauge.estimation.cells import UNKNOWN
 from cangauge.settings import FrameIds
@@ -92,9 +92,9 @@ def test_each_value_is_sent_clipped_and_read_as_the_dbc_decodes_it(values: list[
     reader, given_values = SocReader(), dict(zip(SENT, values, strict=True))
     read: dict[str, float] = {}
     for message in frames_of(SocPublisher(), given_values):
-        content = reader.read(message)
-        assert content is not None
-        read |= content._asdict()
+        _, content = reader.read(message)
+        assert content
+        read |= content
         for name, value in decoded(message).items():
             if name in SENT:
                 assert math.isnan(read[name]) or read[name] == pytest.approx(value)
@@ -117,9 +117,13 @@ def test_status_reasons_and_age() -> None:
     values = decoded(first)
     assert (values["status"], values["age_s"]) == (2, 12)
     assert values["reason"] == (1 << 1) | (1 << 15)
-    read = SocReader().read(first)
-    assert isinstance(read, SocEstimate)
-    assert read[2:] == (Status.DEGRADED, reasons, 12.0)
+    name, read = SocReader().read(first)
+    assert name == "soc_estimate"
+    assert [read[each] for each in ("status", "reason", "age_s")] == [
+        Status.DEGRADED,
+        reasons,
+        12.0,
+    ]
     ages = [decoded(SocPublisher().estimate_frame(estimate(), age_s))["age_s"]
             for age_s in (0.0, 0.99, 1.0, 29.99, 30.0, 1e9)]  # fmt: skip
     assert ages == [0, 0, 1, 29, 30, 30]
@@ -131,17 +135,14 @@ def test_unknown_values_have_the_codes_of_the_dbc() -> None:
     unknown = estimate(**dict.fromkeys(list(SENT)[:5], NAN))
     frames = [*publisher.publish_periodic(unknown, 0, NAN), *pack]
     for message in frames:
-        layout, content = (
-            database().get_message_by_frame_id(message.arbitration_id),
-            reader.read(message),
-        )
-        assert content is not None
+        layout = database().get_message_by_frame_id(message.arbitration_id)
+        _, content = reader.read(message)
         raw = layout.decode(message.data, scaling=False, decode_choices=False)
         for signal in layout.signals:
             if signal.name in SENT or signal.name in {"age_s", "weakest_cell"}:
                 ones = -(1 << signal.length - 1) if signal.is_signed else (1 << signal.length) - 1
                 assert raw[signal.name] == ones, signal.name
-                assert math.isnan(getattr(content, signal.name))
+                assert math.isnan(content[signal.name])
     assert decoded(frames[-1])["sum_check"] == 0
 
 
@@ -161,7 +162,7 @@ def test_counters_crcs_and_damaged_bits_of_each_frame() -> None:
     for message in frames_of(publisher):
         for bit in range(64):
             message.data[bit // 8] ^= 1 << bit % 8
-            assert reader.read(message) is None
+            assert not reader.read(message)[1]
             message.data[bit // 8] ^= 1 << bit % 8
     assert reader.refused == 5 * 64
 
@@ -172,10 +173,10 @@ def test_ids_are_configured_differ_and_are_protected() -> None:
     ids = FrameIds(0x10, 0x11, 0x12, 0x13, 0x14, 0x15)
     frames = frames_of(SocPublisher(ids))
     assert [each.arbitration_id for each in frames] == [0x10, 0x11, 0x13, 0x14, 0x15]
-    assert SocReader().read(frames[0]) is None
+    assert not SocReader().read(frames[0])[1]
     swapped = SocReader(FrameIds(soc_estimate=0x5A1, soc_detail=0x5A0))
     for message in SocPublisher().publish_periodic(estimate(), 7, 0.0):
-        assert swapped.read(message) is None
+        assert not swapped.read(message)[1]
     assert swapped.refused == 2
 
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 
 import pytest
 from simulated import EPOCH_S, GIVEN, SimulatedPort, frames_every, simulate
 
 from cangauge.bus.open import BusAddress
-from cangauge.bus.publish import SocEstimate
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
@@ -30,7 +30,7 @@ KERNEL = BusAddress("socketcan", "can0")
 
 def run(
     path: Path, seconds: float, stamp: Callable[[float], float]
-) -> tuple[Pipeline, list[float], list[SocEstimate], list[str]]:
+) -> tuple[Pipeline, list[float], list[SimpleNamespace], list[str]]:
     """Record a service whose frames are stamped by a function of their arrival [s].
 
     Returns the pipeline, bus time of the samples, published estimates, and lines of the loop. The

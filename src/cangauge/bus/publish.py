@@ -25,96 +25,20 @@ from cantools.database.can import Message
 
 from cangauge._resources import shared_file
 from cangauge._text import plain
-from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
+from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.settings import FrameIds
 from cangauge.types import REASONS, CellReport, Estimate, Health, Power, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
-DETAIL_EVERY_S: Final = 1.0
-DETAIL_EVERY_BEATS: Final = 10
-"""Periods of the frames: [s] of log time, and beats of `ESTIMATE_EVERY_S`."""
+DETAIL_EVERY: Final = 10
+"""Period of SOC_ESTIMATE [s], and of the other frames [periods of it]."""
 EARLY_S: Final = 0.01
 """A sample may be this early for a frame that is due [s]: else jitter could halve the rate."""
 SAMPLES_MODULO: Final = 1 << 16
 """Modulus of the sample count in SOC_DETAIL."""
 ACKNOWLEDGE_EVERY: Final = 4
 """Most samples between two SOC_DETAIL under the replay clock: `replay` waits for them."""
-
-_LENGTH: Final = 8
-
-
-# Contents of the frames: fields are the DBC's signals (`reason` is `reasons`); NaN: not available.
-
-
-class SocEstimate(NamedTuple):
-    """SoC and its standard deviation [%]; `age_s`: whole seconds since charge was counted [s]."""
-
-    soc_pct: float
-    soc_std_pct: float
-    status: Status
-    reasons: Reason
-    age_s: float = math.nan
-
-
-class SocDetail(NamedTuple):
-    """`residual_v` is measured minus predicted voltage [V]; samples are modulo `SAMPLES_MODULO`."""
-
-    soc_newton_pct: float
-    soc_coulomb_pct: float
-    residual_v: float
-    samples: int
-
-
-class SocHealth(NamedTuple):
-    """Capacity, resistance relative to the model's [-], offset of the current sensor."""
-
-    capacity_ah: float
-    capacity_std_ah: float
-    resistance_ratio: float
-    resistance_std: float
-    current_offset_a: float
-
-
-class SocPower(NamedTuple):
-    """Possible currents, both positive, and the energy left."""
-
-    discharge_a: float
-    discharge_std_a: float
-    charge_a: float
-    charge_std_a: float
-    energy_kwh: float
-    energy_std_kwh: float
-
-
-class SocCells(NamedTuple):
-    """Weakest cell; spread: SoC of the strongest less its own; pack voltage less the sum of cells.
-
-    `sum_check` is 0: not known, 1: they agree, 2: they differ by more than both sensors allow.
-    """
-
-    weakest_cell: float
-    weakest_soc_pct: float
-    weakest_soc_std_pct: float
-    cell_spread_pct: float
-    sum_error_v: float
-    sum_check: float
-
-
-SocContent = SocEstimate | SocDetail | SocHealth | SocPower | SocCells
-_CONTENTS: Final[dict[str, Callable[..., SocContent]]] = {
-    "soc_estimate": SocEstimate,
-    "soc_detail": SocDetail,
-    "soc_health": SocHealth,
-    "soc_power": SocPower,
-    "soc_cells": SocCells,
-}
-_KINDS: Final[dict[str, Callable[[int], int]]] = {
-    "status": Status,
-    "reasons": Reason,
-    "samples": int,
-}
-"""Fields that are not floats."""
 
 
 class PackReport(NamedTuple):
@@ -141,22 +65,28 @@ class PackReport(NamedTuple):
         if cells is not None and cells["weakest"] < 0:
             cells["weakest"] = None
         return {
-            "health": plain(_possible(self.health._asdict(), _OF_HEALTH)),
-            "power": plain(_possible(self.power._asdict(), _OF_POWER)),
+            "health": plain(_possible(self.health)),
+            "power": plain(_possible(self.power)),
             "cells": cells and plain(cells),
             "notices": self.notices,
         }
 
 
-_OF_HEALTH: Final = {"capacity_ah": "capacity_std_ah", "resistance_ratio": "resistance_std"}
-_OF_POWER: Final = {"energy_wh": "energy_std_wh"}
-"""Values that are never negative, with their standard deviations."""
+_NEVER_NEGATIVE: Final = {
+    "capacity_ah": "capacity_std_ah",
+    "resistance_ratio": "resistance_std",
+    "energy_wh": "energy_std_wh",
+}
+"""Values of every pack that are never negative, with their standard deviations."""
 
 
-def _possible(values: dict[str, float], never_negative: Mapping[str, str]) -> dict[str, float]:
+def _possible(found: Health | Power) -> dict[str, float]:
     """Return values, NaN for those that no pack can have: the current contradicts the voltage."""
-    impossible = {name: std for name, std in never_negative.items() if values[name] < 0.0}
-    return values | dict.fromkeys([*impossible, *impossible.values()], math.nan)
+    values: dict[str, float] = found._asdict()
+    for name, std in _NEVER_NEGATIVE.items():
+        if values.get(name, 0.0) < 0.0:
+            values[name] = values[std] = math.nan
+    return values
 
 
 NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
@@ -165,41 +95,47 @@ NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
 """What `PackReport.to_dict` gives before the first sample."""
 
 
+_KINDS: Final[dict[str, Callable[[int], int]]] = {
+    "status": Status,
+    "reason": Reason,
+    "samples": int,
+}
+"""Signals that are not floats."""
+
+
 class _Layout:
     """A message of soc_estimate.dbc: codecs by signal, counter and CRC."""
 
     def __init__(self, message: Message, path: Path) -> None:
-        self._codecs: list[tuple[str, SignalCodec, float, float]] = []
-        for signal in message.signals:
-            if not signal.name.startswith(("counter_", "crc_")):
-                codec = signal_codec(message, signal, source=path, field=message.name)
-                name = "reasons" if signal.name == "reason" else signal.name
-                self._codecs.append((name, codec, *codec.range))
+        self._length = message.length
+        self._codecs = {
+            signal.name: signal_codec(message, signal, source=path, field=message.name)
+            for signal in message.signals
+            if not signal.name.startswith(("counter_", "crc_"))
+        }
         ids = getattr(message.dbc, "attributes", {})["E2EDataIdList"].value
         self._rule = E2eRule("e2e_02", data_id_list=tuple(bytes.fromhex(str(ids))))
 
     def encode(self, counter: int, values: Mapping[str, float]) -> bytes:
         """Return the payload; values are clipped to the signal's range, NaN becomes its code."""
-        payload = bytearray(_LENGTH)
-        for name, codec, low, high in self._codecs:
-            value = float(values[name])
-            if not math.isnan(value):
-                value = min(max(value, low), high)
-            codec.encode_into(payload, value)
+        payload = bytearray(self._length)
+        for name, codec in self._codecs.items():
+            value, (low, high) = float(values[name]), codec.range
+            codec.encode_into(payload, value if math.isnan(value) else min(max(value, low), high))
         return self._rule.protect(payload, counter)
 
-    def decode(self, data: bytes | bytearray) -> dict[str, Any] | None:
-        """Return the values by name; None for a damaged frame."""
-        if len(data) != _LENGTH or not self._rule.is_whole(data):
-            return None
-        values: dict[str, Any] = {name: codec.decode(data) for name, codec, _, _ in self._codecs}
+    def decode(self, data: bytes | bytearray) -> dict[str, Any]:
+        """Return the values by name; none for a damaged frame."""
+        if len(data) != self._length or not self._rule.is_whole(data):
+            return {}
+        values: dict[str, Any] = {name: codec.decode(data) for name, codec in self._codecs.items()}
         return values | {name: _KINDS[name](int(values[name])) for name in _KINDS.keys() & values}
 
 
-def _layouts() -> dict[str, _Layout]:
+def _layouts(ids: FrameIds) -> dict[str, _Layout]:
     path = shared_file("dbc", "soc_estimate.dbc")
     message = load_dbc(path).get_message_by_name
-    return {name: _Layout(message(name.upper()), path) for name in _CONTENTS}
+    return {name: _Layout(message(name.upper()), path) for name in ids.published.values()}
 
 
 class SocPublisher:
@@ -212,10 +148,10 @@ class SocPublisher:
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
         self.ids = ids or FrameIds()
         self._acknowledge_every = acknowledge_every
-        self._layouts = _layouts()
+        self._layouts = _layouts(self.ids)
         self._made = dict.fromkeys(self._layouts, 0)
         self._beats = self._acknowledged = 0
-        self._due_s = {ESTIMATE_EVERY_S: -math.inf, DETAIL_EVERY_S: -math.inf}
+        self._due_s = {1: -math.inf, DETAIL_EVERY: -math.inf}
 
     def publish_periodic(
         self,
@@ -231,7 +167,7 @@ class SocPublisher:
         frames are due.
         """
         frames = [self.estimate_frame(estimate, age_s)]
-        is_due = self._beats % DETAIL_EVERY_BEATS == 0
+        is_due = self._beats % DETAIL_EVERY == 0
         self._beats += 1
         is_behind = self._acknowledge_every is not None and samples != self._acknowledged
         return frames + self._slow_frames(estimate, samples, report, is_due, is_behind)
@@ -241,22 +177,22 @@ class SocPublisher:
     ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; see `publish_periodic`."""
         frames = []
-        if self._is_due(ESTIMATE_EVERY_S, estimate.time_s):
+        if self._is_due(1, estimate.time_s):
             frames.append(self.estimate_frame(estimate))
-        is_due = self._is_due(DETAIL_EVERY_S, estimate.time_s)
+        is_due = self._is_due(DETAIL_EVERY, estimate.time_s)
         is_behind = samples - self._acknowledged >= (self._acknowledge_every or math.inf)
         return frames + self._slow_frames(estimate, samples, report, is_due, is_behind)
 
-    def _is_due(self, every_s: float, now_s: float) -> bool:
-        """Return whether a frame is due at a log time: on the grid, or on a new one.
+    def _is_due(self, periods: int, now_s: float) -> bool:
+        """Return whether a frame is due at a log time: on the grid of its period, or on a new one.
 
         The grid is a new one after a pause, and in a new log, which begins earlier.
         """
-        due_s = self._due_s[every_s]
+        every_s, due_s = periods * ESTIMATE_EVERY_S, self._due_s[periods]
         if not (now_s >= due_s - EARLY_S or now_s < due_s - every_s - EARLY_S):
             return False
         is_on_grid = due_s - EARLY_S <= now_s < due_s + every_s
-        self._due_s[every_s] = every_s + (due_s if is_on_grid else now_s)
+        self._due_s[periods] = every_s + (due_s if is_on_grid else now_s)
         return True
 
     def _slow_frames(
@@ -272,35 +208,43 @@ class SocPublisher:
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as in `publish_periodic`."""
-        age_s = age_s if math.isnan(age_s) else math.floor(age_s)
-        soc_pct, std_pct, reasons = estimate.soc_pct, estimate.soc_std_pct, estimate.reasons
-        content = SocEstimate(soc_pct, std_pct, estimate.status, reason_bits(reasons), age_s)
-        return self._frame("soc_estimate", content)
+        values = {
+            "soc_pct": estimate.soc_pct,
+            "soc_std_pct": estimate.soc_std_pct,
+            "status": estimate.status,
+            "reason": reason_bits(estimate.reasons),
+            "age_s": age_s if math.isnan(age_s) else math.floor(age_s),
+        }
+        return self._frame("soc_estimate", values)
 
     def detail_frame(self, estimate: Estimate, samples: int) -> can.Message:
         """Return SOC_DETAIL with the next counter."""
         self._acknowledged = samples
-        newton_pct, coulomb_pct = estimate.soc_newton_pct, estimate.soc_coulomb_pct
-        detail = SocDetail(newton_pct, coulomb_pct, estimate.residual_v, samples % SAMPLES_MODULO)
-        return self._frame("soc_detail", detail)
+        values = estimate._asdict() | {"samples": samples % SAMPLES_MODULO}
+        return self._frame("soc_detail", values)
 
     def report_frames(self, report: PackReport) -> list[can.Message]:
         """Return SOC_HEALTH, SOC_POWER and, where there are cells, SOC_CELLS."""
-        able = report.power
-        energy_kwh, std_kwh = 1e-3 * able.energy_wh, 1e-3 * able.energy_std_wh
-        frames = [
-            self._frame("soc_health", SocHealth(*report.health[:5])),
-            self._frame("soc_power", SocPower(*able[:4], energy_kwh, std_kwh)),
-        ]
+        health = report.health._asdict() | {"current_offset_a": report.health.offset_a}
+        power = report.power._asdict()
+        power["energy_kwh"] = 1e-3 * report.power.energy_wh
+        power["energy_std_kwh"] = 1e-3 * report.power.energy_std_wh
+        frames = [self._frame("soc_health", health), self._frame("soc_power", power)]
         if (cells := report.cells) is not None:
-            weakest = math.nan if cells.weakest < 0 else float(cells.weakest)
-            check = float(not math.isnan(cells.sum_error_v)) + cells.is_sum_wrong
-            frames.append(self._frame("soc_cells", SocCells(weakest, *cells[2:6], check)))
+            values = {
+                "weakest_cell": math.nan if cells.weakest < 0 else cells.weakest,
+                "weakest_soc_pct": cells.soc_pct,
+                "weakest_soc_std_pct": cells.soc_std_pct,
+                "cell_spread_pct": cells.spread_pct,
+                "sum_error_v": cells.sum_error_v,
+                "sum_check": (not math.isnan(cells.sum_error_v)) + cells.is_sum_wrong,
+            }
+            frames.append(self._frame("soc_cells", values))
         return frames
 
-    def _frame(self, name: str, content: SocContent) -> can.Message:
+    def _frame(self, name: str, values: Mapping[str, float]) -> can.Message:
         """Return a frame with the next counter."""
-        data = self._layouts[name].encode(self._made[name], content._asdict())
+        data = self._layouts[name].encode(self._made[name], values)
         self._made[name] += 1
         return can.Message(arbitration_id=getattr(self.ids, name), is_extended_id=False, data=data)
 
@@ -311,18 +255,20 @@ class SocReader:
     def __init__(self, ids: FrameIds | None = None) -> None:
         self.ids = ids or FrameIds()
         self.refused = 0
-        self._layouts = _layouts()
+        self._layouts = _layouts(self.ids)
 
-    def read(self, message: can.Message) -> SocContent | None:
-        """Return the content of a frame; None for other frames and damaged ones."""
-        if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
-            return None
+    def read(self, message: can.Message) -> tuple[str, dict[str, Any]]:
+        """Return name and values of a frame, by the DBC's signals (NaN: not available).
+
+        ("", {}) for other frames and damaged ones.
+        """
         name = self.ids.published.get(message.arbitration_id)
-        if name is None:
-            return None
+        is_data = not (message.is_extended_id or message.is_error_frame or message.is_remote_frame)
+        if name is None or not is_data:
+            return "", {}
         values = self._layouts[name].decode(message.data)
-        self.refused += values is None
-        return None if values is None else _CONTENTS[name](**values)
+        self.refused += not values
+        return (name, values) if values else ("", {})
 
 
 def reason_bits(reasons: Reason) -> Reason:

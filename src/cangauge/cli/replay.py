@@ -155,22 +155,21 @@ def _line(state: ReplayState) -> str:
     if state.acknowledged is not None:
         text += f"; {state.acknowledged} of {state.samples} samples acknowledged"
         text += f", {state.lost} LOST" if state.lost else ""
-    if state.soc is not None:
-        text += f"; latest SoC received {number(state.soc.soc_pct, 2, '%')}"
+    if state.soc:
+        text += f"; latest SoC received {number(state.soc['soc_pct'], 2, '%')}"
     return text
 
 
 def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str, Any]:
     from cangauge.replay.steps import LogSource
 
-    soc_pct, soc_std_pct = (None, None) if state.soc is None else state.soc[:2]
     result = {name: value for name, value in vars(state).items() if name != "soc"} | {
         "bus": bus.name,
         "samples": state.samples if source.counts_samples else None,
         "speed": state.speed,
         "unsent": bus.unsent,
-        "soc_pct": soc_pct,
-        "soc_std_pct": soc_std_pct,
+        "soc_pct": state.soc.get("soc_pct"),
+        "soc_std_pct": state.soc.get("soc_std_pct"),
     }
     if isinstance(source, LogSource):
         return result | {"quantisation": source.quantization, "assumed": assumed_of([source.log])}

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import can
 
@@ -23,8 +23,6 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import (
     ACKNOWLEDGE_EVERY,
     SAMPLES_MODULO,
-    SocDetail,
-    SocEstimate,
     SocReader,
 )
 from cangauge.bus.time_source import COUNT_EVERY, MICROSECONDS, clock_frame, count_frame
@@ -83,7 +81,7 @@ class ReplayState:
 
     `samples` are those that a receiver makes of the frames, where known; `acknowledged` those that
     it has processed, `lost` those that never reached it (both None below full speed, where only the
-    receiver knows); `soc` its latest estimate.
+    receiver knows); `soc` the values of its latest SOC_ESTIMATE.
     """
 
     frames: int = 0
@@ -93,7 +91,7 @@ class ReplayState:
     lost: int | None = None
     log_seconds: float = 0.0
     seconds: float = 0.0
-    soc: SocEstimate | None = None
+    soc: dict[str, Any] = field(default_factory=dict)
 
     @property
     def speed(self) -> float | None:
@@ -307,12 +305,14 @@ class _Player:
     def _listen_once(self, timeout_s: float) -> bool:
         """Receive one frame; return whether one came in time [s]."""
         message = self._bus.receive(timeout_s)
-        content = None if message is None else self._reader.read(message)
-        if isinstance(content, SocEstimate) and math.isfinite(content.soc_pct):
-            self.state.soc = content
-        elif isinstance(content, SocDetail) and self.is_max:
-            self._acknowledge(content.samples)
-        return message is not None
+        if message is None:
+            return False
+        name, values = self._reader.read(message)
+        if name == "soc_estimate" and math.isfinite(values["soc_pct"]):
+            self.state.soc = values
+        elif name == "soc_detail" and self.is_max:
+            self._acknowledge(values["samples"])
+        return True
 
     def _acknowledge(self, count: int) -> None:
         self._reported_s = time.monotonic()
