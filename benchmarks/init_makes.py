@@ -36,8 +36,10 @@ import numpy as np
 from cangauge.bus.database import load_dbc
 from cangauge.errors import InputError
 from cangauge.extras.discovery.by_name import clear_roles, named_signals
-from cangauge.extras.discovery.candidate import SignalCandidate
-from cangauge.extras.discovery.search import Findings, search
+from cangauge.extras.discovery.candidate import Candidate
+from cangauge.extras.discovery.fields import collect
+from cangauge.extras.discovery.proposal import Proposal
+from cangauge.extras.discovery.search import search
 from frame_layouts import STEP_S, Bits, Frame, encode
 
 SECONDS = 120.0
@@ -589,7 +591,7 @@ def capture(data: Path, make: Make) -> Iterator[can.Message]:
 
 
 def rank(
-    found: list[SignalCandidate], wanted: tuple[int, Bits], messages: list[can.Message]
+    found: list[Candidate], wanted: tuple[int, Bits], messages: list[can.Message]
 ) -> int | None:
     """Return the place of a signal among candidates, None where it is not among them.
 
@@ -603,7 +605,12 @@ def rank(
         if each.stream.arbitration_id != number or each.stream.selector is not None:
             continue
         own = Bits(
-            each.start, each.place.width, each.place.is_motorola, 1.0, 0.0, each.place.is_signed
+            each.place.start(each.stream.length),
+            each.place.width,
+            each.place.is_motorola,
+            1.0,
+            0.0,
+            each.place.is_signed,
         ).raw(payload)
         apart = own - truth
         if apart[0] == apart.max() == apart.min() and (apart[0] == 0 or bits.offset or bits.signed):
@@ -616,7 +623,8 @@ class Result:
     """Ranks and scales of a make, and the cost of the search."""
 
     make: Make
-    findings: Findings
+    findings: Proposal
+    ids: int
     current: int | None
     voltage: int | None
     seconds: float
@@ -634,7 +642,7 @@ class Result:
             if place is None:
                 texts.append("–")
                 continue
-            found = getattr(self.findings, role)[place - 1].scale
+            found = self.findings.candidates[role][place - 1].scale
             same = np.isclose(found, bits.scale)
             texts.append(f"{found:g}" if same else f"{found:g} (is {bits.scale:g})")
         return " | ".join(texts)
@@ -651,8 +659,9 @@ def evaluate(data: Path, make: Make, *, nominal: bool = False) -> Result:
     findings = search(messages, NOMINAL_V * make.volts if nominal else None)
     seconds = time.process_time() - before
     return Result(
-        make, findings, rank(findings.current, make.current, messages),
-        rank(findings.voltage, make.voltage, messages), seconds,
+        make, findings, len(collect(messages)),
+        rank(findings.candidates["current"], make.current, messages),
+        rank(findings.candidates["voltage"], make.voltage, messages), seconds,
     )  # fmt: skip
 
 
@@ -734,16 +743,16 @@ def main() -> None:
                 options.data, replace(make, seed=options.seed), nominal=options.nominal
             )
             found += result.is_found
-            soc = result.findings.soc_reference
+            soc = result.findings.candidates["soc_reference"]
             print(
-                f"| {title} | {make.name} | {result.findings.streams} | {result.current or '–'} |"
+                f"| {title} | {make.name} | {result.ids} | {result.current or '–'} |"
                 f" {result.voltage or '–'} | {result.scales()} | {soc[0].name if soc else '–'} |"
                 f" {result.seconds:.1f} |",
                 flush=True,
             )
             if options.verbose:
                 for role in ("current", "voltage"):
-                    for each in getattr(result.findings, role):
+                    for each in result.findings.candidates[role]:
                         print(f"    {role} {each.name} scale {each.scale:g} score {each.score:.1f}"
                               f" evidence {each.evidence:.1f} r {each.correlation:.3f}"
                               f" R {each.resistance_ohm:.3g} with {each.partner}")  # fmt: skip

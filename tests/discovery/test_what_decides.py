@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.captures import open_capture
-from cangauge.extras.discovery.candidate import SignalCandidate
+from cangauge.extras.discovery.candidate import Candidate
 from cangauge.extras.discovery.search import search
 from live import in_process
 
@@ -122,14 +122,14 @@ def test_two_limits_that_move_together_are_no_pair(seed: int) -> None:
     drift = walk(seed)
     limits = [raw(drift + 305.0, 0.1), raw(drift + 102.03, 0.1)]
     found = search(frames({0x2A3: limits, 0x310: [np.arange(10 * SECONDS) % 256]}))
-    assert not (found.is_clear("current") and found.is_clear("voltage"))
-    assert all(each.evidence < 1.0 for each in found.current)
+    assert not {"current", "voltage"} <= {*found.clear}
+    assert all(each.evidence < 1.0 for each in found.candidates["current"])
 
 
-def pack(nominal_v: float) -> SignalCandidate:
+def pack(nominal_v: float) -> Candidate:
     amps = load(1)
     words = [raw(amps + 800.0, 0.05), raw(375.0 - 0.1 * amps, 0.05)]
-    return search(frames({0x2A1: words}), nominal_v).voltage[0]
+    return search(frames({0x2A1: words}), nominal_v).candidates["voltage"][0]
 
 
 def test_the_stated_voltage_decides_and_what_else_fits_is_listed() -> None:
@@ -161,7 +161,9 @@ def test_a_parked_car_gets_no_map(tmp_path: Path, choice: tuple[str, ...]) -> No
     assert done.out.startswith("No map: no voltage follows a current in steps")
     assert done.err.endswith(": record a drive\n")
     assert not (tmp_path / "out").exists()
-    reached = [max(-each.low, each.high) for each in search(open_capture(path)).current]
+    reached = [
+        max(-each.low, each.high) for each in search(open_capture(path)).candidates["current"]
+    ]
     assert max(reached, default=0.0) <= 1500.0
 
 
@@ -170,7 +172,7 @@ def test_a_pack_sags_by_no_more_than_a_fifth(volts: float, is_pack: bool) -> Non
     amps = load(1)
     words = [raw(amps, 0.1, -500.0), raw(370.0 - volts / 150.0 * amps, 0.1)]
     found = search(frames({0x100: words}))
-    assert ("0x100 16|16@1+" in {each.name for each in found.voltage}) == is_pack
+    assert ("0x100 16|16@1+" in {each.name for each in found.candidates["voltage"]}) == is_pack
 
 
 def test_few_steps_of_the_current_prove_nothing() -> None:

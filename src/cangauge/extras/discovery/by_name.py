@@ -12,10 +12,10 @@ from array import array
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from statistics import median
-from typing import Any, ClassVar, Final
+from typing import Final
 
 import can
 import numpy as np
@@ -25,7 +25,7 @@ from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec, signal_codec
 from cangauge.bus.vehicle import EXTENDED
 from cangauge.errors import InputError
-from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate, range_text
+from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate
 from cangauge.extras.discovery.fields import LEAST_BITS
 from cangauge.extras.discovery.pairs import FEW_MOVES
 from cangauge.logs.quantities import unit_of
@@ -66,18 +66,11 @@ _NEUTRAL: Final = _words(
 """Words that a quantity may have whose message alone is the pack's."""
 _PIECES: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _RUNS: Final = re.compile(r"[a-z]+")
+_ALL: Final = _BATTERY.union(
+    _HIGH, _PARTS, _LIMITS, *(_words(each.words) for each in ROLES.values())
+)
 _KNOWN: Final = re.compile(
-    "|".join(
-        word
-        for word in sorted(
-            _BATTERY.union(
-                _HIGH, _PARTS, _LIMITS, *(_words(each.words) for each in ROLES.values())
-            ),
-            key=len,
-            reverse=True,
-        )
-        if len(word) > 1
-    )
+    "|".join(sorted((word for word in _ALL if len(word) > 1), key=len, reverse=True))
 )
 _JOINED: Final = re.compile(f"(?:{_KNOWN.pattern})++")
 _HIGH_V: Final = 65.536
@@ -87,7 +80,7 @@ _CLEARLY: Final = 1.0
 """Distance in score of the first signal that makes it clear: one matching word."""
 _FOLLOWED: Final = 2.0
 """What the physics is worth at most: two matching words."""
-_PROVEN: Final = 0.5
+PROVEN: Final = 0.5
 """Share of a voltage's changes by a current from which on the two need no names."""
 _WEIGHED: Final = 8
 """Likeliest currents and voltages by name whose pairs are tried."""
@@ -95,90 +88,31 @@ _CODES_APART: Final = 1.0 / 16.0
 """Least distance of a code from the measured numbers, as a share of the signal's range."""
 
 
-def _nothing() -> FloatArray:
-    return np.empty(0)
+@dataclass(frozen=True, eq=False)
+class _NamedSignal:
+    """A signal of a DBC and its values in a capture.
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class NamedSignal(Candidate):
-    """A signal of a DBC; its score is in units of one matching word.
-
-    Its evidence is the share of the voltage's changes that follow the current, by the best partner.
-
-    Parameters
-    ----------
-    bits, holds : int, tuple of float
-        Length and range that the DBC gives it; the range in its unit.
-    against : tuple of str
-        Why it may not have the role.
-    is_wrapped : bool
-        Whether the DBC reads a signed number as an unsigned one.
-    not_available : tuple of int
-        Codes in the capture that mean "no value".
-    time_s, value : array
-        Its values in the capture.
+    `codes` are those that mean "no value", by their distance from all others.
     """
 
-    HEAD: ClassVar = ("signal, by name and unit", "range", "against it")
-
-    bits: int
+    message: str
+    codec: SignalCodec
     holds: tuple[float, float]
-    against: tuple[str, ...] = ()
-    is_wrapped: bool = False
-    not_available: tuple[int, ...] = ()
-    time_s: FloatArray = field(default_factory=_nothing, repr=False)
-    value: FloatArray = field(default_factory=_nothing, repr=False)
+    is_wrapped: bool
+    codes: tuple[int, ...]
+    time_s: FloatArray
+    value: FloatArray
 
     @property
-    def name(self) -> str:
-        """Message and signal."""
-        return f"{self.message}.{self.signal}"
+    def period_s(self) -> float:
+        """Median interval of its frames [s]."""
+        return float(np.median(np.diff(self.time_s))) if len(self.time_s) > 1 else math.nan
 
-    @property
-    def is_followed(self) -> bool:
-        """Whether the physics proves it: the voltage follows the current."""
-        return self.evidence > _PROVEN
-
-    @property
-    def is_fit(self) -> bool:
-        """Whether nothing speaks against it, or the physics for it."""
-        return not self.against or self.is_followed
-
-    @property
-    def cells(self) -> tuple[str, ...]:
-        """Cells of a table under `HEAD`."""
-        against = "" if self.is_fit else "; ".join(self.against)
-        holds = f"by DBC {range_text(*self.holds, self.unit)}"
-        return f"{self.message}\n{self.signal}", self.range_text or holds, against
-
-    def comments(self) -> list[str]:
-        """Return the lines that the map states of it."""
-        ends = self.range_text
-        lines = [f"By name and unit{f'; {ends} in the capture' if ends else ', in no capture'}."]
-        if self.evidence:
-            share = f"{100.0 * self.evidence:.0f} %"
-            lines.append(f"Voltage falls when current rises: {share} of the voltage's changes.")
-        return lines
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        names = ("message", "signal", "unit", "score", "evidence")
-        return {
-            **{name: getattr(self, name) for name in names},
-            "against": [*self.against],
-            "not_available": [*self.not_available],
-            "range": None if math.isnan(self.low) else [self.low, self.high],
-        }
-
-    def is_of_one_source(self, other: NamedSignal) -> bool:
-        """Whether two signals are of one message, or of one pack by a word of both names."""
-        shared = _words_of(self.name) & _words_of(other.name) & _BATTERY
-        return self.message == other.message or bool(shared - _ANY_BATTERY)
-
-    def judged(self, role: str, nominal_v: float | None) -> NamedSignal | None:
+    def judged(self, role: str, nominal_v: float | None) -> Candidate | None:
         """Return it with its score for a role and what speaks against it; None: it has none."""
-        wanted, own, of = ROLES[role], _words_of(self.signal), _words_of(self.message)
-        unit = unit_of(wanted.column, self.unit) if self.unit else None
+        wanted, codec = ROLES[role], self.codec
+        own, of = _words_of(codec.name), _words_of(self.message)
+        unit = unit_of(wanted.column, codec.unit) if codec.unit else None
         scale, offset = unit or (1.0, 0.0)
         is_soc, is_pair = role == "soc_reference", role in {"current", "voltage"}
         is_named = bool(own & _words(wanted.words)) or (is_soc and {"state", "charge"} <= own)
@@ -190,7 +124,7 @@ class NamedSignal(Candidate):
             others |= own - _words(wanted.words) - _NEUTRAL
         lowest, highest = wanted.within
         middle = median(scale * np.unique(self.value) + offset) if len(self.value) else lowest
-        if not lowest <= middle <= highest or not (unit or (is_named and not self.unit)):
+        if not lowest <= middle <= highest or not (unit or (is_named and not codec.unit)):
             return None
         if not is_pair and (parts or (others if role == "temperature" else own & _PARTS)):
             return None
@@ -204,11 +138,17 @@ class NamedSignal(Candidate):
         )
         if score <= 0.0 or (is_soc and not is_named):
             return None
+        low = high = math.nan
+        if len(self.value):
+            low, high = float(self.value.min()), float(self.value.max())
+        # Less where nothing of it is sent, or a current stands still.
+        score -= 1.0 * math.isnan(low) + 0.5 * (role == "current" and low == high)
         other = others or (frozenset() if names_pack else parts)
-        most_a, top_v = scale * max(-self.low, self.high), scale * self.holds[1] + offset
+        most_a, top_v = scale * max(-low, high), scale * self.holds[1] + offset
+        bits = codec.field.width
         objections = {
             "no unit": unit is None,
-            f"{self.bits} bits": self.bits < LEAST_BITS,
+            f"{bits} bits": bits < LEAST_BITS,
             f"no word for a {role} in its name": is_pair and not is_named,
             "no word for a pack in its name": is_pair and not (own | of) & _BATTERY,
             f"of another value: {', '.join(sorted(other))}": other,
@@ -217,13 +157,94 @@ class NamedSignal(Candidate):
                 role == "voltage" and unit and top_v <= (nominal_v or _HIGH_V)
             ),
         }
-        against = tuple(text for text, holds in objections.items() if holds)
-        return replace(self, role=role, score=score, against=against)
+        return Candidate(
+            role=role,
+            name=f"{self.message}.{codec.name}",
+            message=self.message,
+            signal=codec.name,
+            unit=codec.unit,
+            score=score,
+            against=tuple(text for text, holds in objections.items() if holds),
+            low=low,
+            high=high,
+            holds=self.holds,
+            period_s=self.period_s,
+            is_wrapped=self.is_wrapped,
+            not_available=self.codes,
+        )
+
+
+class _NamedFrames:
+    """Frames of one message: their times, and which of its distinct payloads each holds."""
+
+    def __init__(self) -> None:
+        self.time_s, self.number = array("d"), array("L")
+        self.payloads: dict[bytes, int] = {}
+
+    def add(self, message: can.Message) -> None:
+        """Add a frame."""
+        self.time_s.append(message.timestamp)
+        self.number.append(self.payloads.setdefault(bytes(message.data), len(self.payloads)))
+
+    def signals(self, message: Message) -> Iterator[_NamedSignal]:
+        """Yield the signals that fit into the message, with their values."""
+        for signal in message.signals:
+            with suppress(InputError):
+                codec = signal_codec(message, signal, source="", field=signal.name)
+                yield self._signal(message, signal, codec)
+
+    def _signal(self, message: Message, signal: Signal, codec: SignalCodec) -> _NamedSignal:
+        low, high = codec.range
+        if signal.minimum is not None and signal.maximum is not None:
+            low, high = max(low, float(signal.minimum)), min(high, float(signal.maximum))
+        decoded = self._decoded(codec, message.length)
+        is_wrapped = codec.wrapped_bits(decoded) == codec.field.width
+        if is_wrapped:
+            codec = replace(codec, is_signed=True)
+            decoded = self._decoded(codec, message.length)
+        codes = _codes(codec, decoded)
+        decoded[np.isin(codec.raw_numbers(decoded), codes)] = math.nan
+        value = decoded[np.array(self.number)]
+        good = np.isfinite(value)
+        return _NamedSignal(
+            message=message.name,
+            codec=codec,
+            holds=(low, high),
+            is_wrapped=is_wrapped,
+            codes=tuple(codes),
+            time_s=np.array(self.time_s)[good],
+            value=value[good],
+        )
+
+    def _decoded(self, codec: SignalCodec, length: int) -> FloatArray:
+        """Return the value of each payload; NaN where it is too short or holds none."""
+        return np.array(
+            [
+                codec.decode(payload[:length])
+                if len(payload) >= length and codec.is_in(payload[:length])
+                else math.nan
+                for payload in self.payloads
+            ]
+        )
+
+
+def _codes(codec: SignalCodec, values: FloatArray) -> list[int]:
+    """Return the codes at the ends of a signal's range that lie far from all measured numbers."""
+    if codec.float_format:
+        return []
+    codes, raw = [], codec.raw_numbers(values)
+    lowest, highest = codec.raw_range
+    for code in (lowest, highest) if codec.is_signed else (highest,):
+        far = np.abs(raw - code)
+        far = far[far > 0.0]
+        if (raw == code).any() and not (far < _CODES_APART * (highest - lowest)).any():
+            codes.append(code)
+    return codes
 
 
 def named_signals(
     database: Database, messages: Iterable[can.Message], nominal_v: float | None = None
-) -> dict[str, tuple[NamedSignal, ...]]:
+) -> dict[str, list[Candidate]]:
     """Return the likeliest signals of each role, best first.
 
     Parameters
@@ -253,154 +274,70 @@ def named_signals(
     if is_capture and not frames:
         cure = "is it of this car and this bus?"
         raise InputError("no message of this DBC is in the capture", field="--dbc", cure=cure)
-    found: dict[str, list[NamedSignal]] = {role: [] for role in ROLES}
-    for key in list(frames) if is_capture else of_dbc:
-        for made in frames[key].signals(of_dbc[key]):
-            for role, signals in found.items():
-                if judged := made.judged(role, nominal_v):
-                    is_missing = is_capture and not len(made.value)
-                    is_still = role == "current" and made.low == made.high
-                    score = judged.score - 1.0 * is_missing - 0.5 * is_still
-                    signals.append(replace(judged, score=score))
-    for signals in found.values():
-        signals.sort(key=attrgetter("score"), reverse=True)
-    _weigh(found["current"], found["voltage"])
-    current, voltage = found["current"], found["voltage"]
-    found["current"] = _partnerless(current, voltage, "voltage")
-    found["voltage"] = _partnerless(voltage, current, "current")
-    for signals in found.values():
-        signals.sort(key=attrgetter("is_fit", "score"), reverse=True)
-    return {role: tuple(signals[:SHOWN]) for role, signals in found.items()}
+    keys = list(frames) if is_capture else of_dbc
+    signals = {
+        (signal.message, signal.codec.name): signal
+        for key in keys
+        for signal in frames[key].signals(of_dbc[key])
+    }
+    found: dict[str, list[Candidate]] = {}
+    for role in ROLES:
+        judged = (signal.judged(role, nominal_v) for signal in signals.values())
+        found[role] = sorted(filter(None, judged), key=attrgetter("score"), reverse=True)
+    current, voltage = _weighed(found["current"], found["voltage"], signals)
+    found["current"] = _partnered(current, voltage, "voltage")
+    found["voltage"] = _partnered(voltage, current, "current")
+    return {
+        role: sorted(of, key=attrgetter("is_fit", "score"), reverse=True)[:SHOWN]
+        for role, of in found.items()
+    }
 
 
-def clear_roles(found: Mapping[str, Sequence[NamedSignal]]) -> list[str]:
-    """Return the roles whose first signal is clearly the pack's own.
-
-    Sensors in one message measure one part; a SoC that stands still shows no battery at work.
-    """
-    fit = {role: [each for each in signals if each.is_fit] for role, signals in found.items()}
-    pack = {fit[role][0].message for role in ("current", "voltage") if fit[role]}
-    clear = []
-    for role, signals in fit.items():
-        if not signals:
-            continue
-        first = signals[0]
-        near = [each for each in signals[1:] if first.score - each.score < _CLEARLY]
-        if role == "temperature":
-            is_packs = first.message in pack or bool(_words_of(first.name) & _BATTERY)
-            is_clear = is_packs and all(each.message == first.message for each in near)
-        else:
-            is_clear = not near and not (role == "soc_reference" and first.low == first.high)
-        if is_clear:
-            clear.append(role)
-    return clear
-
-
-class _NamedFrames:
-    """Frames of one message: their times, and which of its distinct payloads each holds."""
-
-    def __init__(self) -> None:
-        self.time_s, self.number = array("d"), array("L")
-        self.payloads: dict[bytes, int] = {}
-
-    def add(self, message: can.Message) -> None:
-        """Add a frame."""
-        self.time_s.append(message.timestamp)
-        self.number.append(self.payloads.setdefault(bytes(message.data), len(self.payloads)))
-
-    def signals(self, message: Message) -> Iterator[NamedSignal]:
-        """Yield the signals that fit into the message, with their values."""
-        for signal in message.signals:
-            with suppress(InputError):
-                codec = signal_codec(message, signal, source="", field=signal.name)
-                yield self._signal(message, signal, codec)
-
-    def _signal(self, message: Message, signal: Signal, codec: SignalCodec) -> NamedSignal:
-        """Return a signal with its values."""
-        low, high = codec.range
-        if signal.minimum is not None and signal.maximum is not None:
-            low, high = max(low, float(signal.minimum)), min(high, float(signal.maximum))
-        bits = codec.field.width
-        nothing = NamedSignal(
-            message=message.name,
-            signal=signal.name,
-            unit=codec.unit,
-            bits=bits,
-            holds=(low, high),
-        )
-        decoded = self._decoded(codec, message.length)
-        is_wrapped = codec.wrapped_bits(decoded) == bits
-        if is_wrapped:
-            codec = replace(codec, is_signed=True)
-            decoded = self._decoded(codec, message.length)
-        codes = _codes(codec, decoded)
-        decoded[np.isin(codec.raw_numbers(decoded), codes)] = math.nan
-        value, time_s = decoded[np.array(self.number)], np.array(self.time_s)
-        value, time_s = value[np.isfinite(value)], time_s[np.isfinite(value)]
-        if not len(value):
-            return nothing
-        return replace(
-            nothing,
-            low=float(value.min()),
-            high=float(value.max()),
-            is_wrapped=is_wrapped,
-            period_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.nan,
-            not_available=tuple(codes),
-            time_s=time_s,
-            value=value,
-        )
-
-    def _decoded(self, codec: SignalCodec, length: int) -> FloatArray:
-        """Return the value of each payload; NaN where it is too short or holds none."""
-        return np.array(
-            [
-                codec.decode(payload[:length])
-                if len(payload) >= length and codec.is_in(payload[:length])
-                else math.nan
-                for payload in self.payloads
-            ]
-        )
-
-
-def _codes(codec: SignalCodec, values: FloatArray) -> list[int]:
-    """Return the codes at the ends of a signal's range that lie far from all measured numbers."""
-    if codec.float_format:
-        return []
-    codes, raw = [], codec.raw_numbers(values)
-    lowest, highest = codec.raw_range
-    for code in (lowest, highest) if codec.is_signed else (highest,):
-        far = np.abs(raw - code)
-        far = far[far > 0.0]
-        if (raw == code).any() and not (far < _CODES_APART * (highest - lowest)).any():
-            codes.append(code)
-    return codes
-
-
-def _weigh(currents: list[NamedSignal], voltages: list[NamedSignal]) -> None:
+def _weighed(
+    currents: Sequence[Candidate],
+    voltages: Sequence[Candidate],
+    signals: Mapping[tuple[str, str], _NamedSignal],
+) -> list[list[Candidate]]:
     """Add the physics to the scores of the likeliest currents and voltages by name."""
-    shares = np.array([[_followed(i, u) for u in voltages[:_WEIGHED]] for i in currents[:_WEIGHED]])
-    for axis, signals in enumerate((currents, voltages)):
+    both = (currents, voltages)
+    i, u = ([signals[c.message, c.signal] for c in each[:_WEIGHED]] for each in both)
+    shares = np.array([[_followed(one, other) for other in u] for one in i])
+    weighed = []
+    for axis, candidates in enumerate(both):
         best = shares.max(1 - axis).tolist() if shares.size else []
-        for number, share in enumerate(best):
-            each = signals[number]
-            score = each.score + _FOLLOWED * round(4.0 * share) / 4.0  # equal of equal packs
-            signals[number] = replace(each, score=score, evidence=share)
+        proven = [
+            replace(
+                each,
+                score=each.score + _FOLLOWED * round(4.0 * share) / 4.0,  # equal of equal packs
+                evidence=share,
+                against=() if share > PROVEN else each.against,
+            )
+            for each, share in zip(candidates, best, strict=False)
+        ]
+        weighed.append([*proven, *candidates[len(best) :]])
+    return weighed
 
 
-def _partnerless(
-    signals: Sequence[NamedSignal], partners: Sequence[NamedSignal], role: str
-) -> list[NamedSignal]:
-    """Return signals of which those without a partner of their source say so."""
+def _partnered(
+    candidates: Sequence[Candidate], partners: Sequence[Candidate], role: str
+) -> list[Candidate]:
+    """Return candidates of which those without a partner of their source say so."""
     fit = [each for each in partners if each.is_fit]
     return [
         each
-        if any(each.is_of_one_source(other) for other in fit)
+        if each.evidence > PROVEN or any(_are_of_one_source(each, other) for other in fit)
         else replace(each, against=(*each.against, f"no {role} of its source"))
-        for each in signals
+        for each in candidates
     ]
 
 
-def _followed(current: NamedSignal, voltage: NamedSignal) -> float:
+def _are_of_one_source(one: Candidate, other: Candidate) -> bool:
+    """Return whether two signals are of one message, or of one pack by a word of both names."""
+    shared = _words_of(one.name) & _words_of(other.name) & _BATTERY
+    return one.message == other.message or bool(shared - _ANY_BATTERY)
+
+
+def _followed(current: _NamedSignal, voltage: _NamedSignal) -> float:
     """Return the share of a voltage's changes that a current explains, adjusted for chance."""
     if not (current.period_s > 0.0 and voltage.period_s > 0.0):
         return 0.0
@@ -418,6 +355,29 @@ def _followed(current: NamedSignal, voltage: NamedSignal) -> float:
         return 0.0
     share = correlation(amps, volts) ** 2
     return max(1.0 - (1.0 - share) * (moves - 1.0) / (moves - 2.0), 0.0)
+
+
+def clear_roles(found: Mapping[str, Sequence[Candidate]]) -> list[str]:
+    """Return the roles whose first signal is clearly the pack's own.
+
+    Sensors in one message measure one part; a SoC that stands still shows no battery at work.
+    """
+    fit = {role: [each for each in of if each.is_fit] for role, of in found.items()}
+    pack = {fit[role][0].message for role in ("current", "voltage") if fit[role]}
+    clear = []
+    for role, candidates in fit.items():
+        if not candidates:
+            continue
+        first, *others = candidates
+        near = [each for each in others if first.score - each.score < _CLEARLY]
+        if role == "temperature":
+            is_packs = first.message in pack or bool(_words_of(first.name) & _BATTERY)
+            is_clear = is_packs and all(each.message == first.message for each in near)
+        else:
+            is_clear = not near and not (role == "soc_reference" and first.low == first.high)
+        if is_clear:
+            clear.append(role)
+    return clear
 
 
 def _words_of(name: str) -> frozenset[str]:

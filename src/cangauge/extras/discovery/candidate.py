@@ -1,10 +1,10 @@
-"""A signal that may have a role: its scale and range, and the evidence for it."""
+"""A signal that may have a role: its place and range, and what is said for and against it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from cangauge.extras.discovery.fields import Place, Stream
 
@@ -16,11 +16,6 @@ MOST_SAG: Final = 0.2
 """Largest share of its voltage by which a pack sags: inverters switch off below."""
 CAPACITY_AH: Final = (2.0, 600.0)
 """Capacities of packs [Ah]: of a scooter to that of a truck."""
-SOC_AGREES: Final = 0.1
-"""Largest relative difference of the capacities that SoC and charge have by two halves."""
-MOVES: Final = 5
-MOVE: Final = 0.1
-"""Steps of a current without which nothing proves it, and their size as a share of its range."""
 LARGEST_RATIO: Final = 2.0
 """Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
 SHOWN: Final = 3
@@ -70,33 +65,69 @@ class Candidate:
     ----------
     role : str
         Key of `ROLES`.
+    name : str
+        As it is shown: id and bits, or message and signal.
     message, signal, unit : str
         Names in the DBC, and its unit.
+    score, evidence : float
+        Larger is likelier, and its part from the physics: log posterior and log likelihood ratio
+        [nats]; by names, matching words and the share of the voltage's changes by the current.
+    against : tuple of str
+        Why it may not have the role.
     low, high : float
         Range of the values in the capture; NaN without one.
+    holds : tuple of float
+        Range that the DBC gives it.
     period_s : float
         Median interval of its frames [s].
     sign : int
         −1 where positive values charge.
-    score, evidence : float
-        Larger is likelier; and its part from the physics.
+    is_wrapped : bool
+        Whether the DBC reads a signed number as an unsigned one.
+    not_available : tuple of int
+        Raw codes in the capture that mean "no value".
     levels : tuple of Level
         Readings by usual scales, its own first; empty where its scale is certain.
+    stream, place : Stream, Place, optional
+        Frames and bits of a signal that the physics found.
+    scale, offset : float
+        value = scale × raw + offset, in A, V, % or °C.
+    steps, moves : int
+        Number of changes in the capture, and of those by a tenth of the range.
+    partner : str
+        What it moves with.
+    correlation, resistance_ohm : float
+        With its partner; NaN where there is none.
+    halves_ohm : tuple of float
+        Resistance by the first and by the second half of the capture.
     """
 
-    HEAD: ClassVar[tuple[str, ...]]
-
     role: str = ""
+    name: str
     message: str
     signal: str
     unit: str
-    low: float = math.nan
-    high: float = math.nan
-    period_s: float = math.nan
-    sign: int = 1
     score: float = 0.0
     evidence: float = 0.0
+    against: tuple[str, ...] = ()
+    low: float = math.nan
+    high: float = math.nan
+    holds: tuple[float, float] = (math.nan, math.nan)
+    period_s: float = math.nan
+    sign: int = 1
+    is_wrapped: bool = False
+    not_available: tuple[int, ...] = ()
     levels: tuple[Level, ...] = ()
+    stream: Stream | None = None
+    place: Place | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    steps: int = 0
+    moves: int = 0
+    partner: str = ""
+    correlation: float = math.nan
+    resistance_ohm: float = math.nan
+    halves_ohm: tuple[float, float] = (math.nan, math.nan)
 
     @property
     def range_text(self) -> str:
@@ -105,45 +136,17 @@ class Candidate:
             return ""
         return range_text(self.low, self.high, self.unit.replace("degC", "°C"), self.sign)
 
+    @property
+    def bits(self) -> frozenset[tuple[int, bool, int]]:
+        """Its bits, each with its id: a gateway repeats frames on other buses."""
+        if self.stream is None or self.place is None:
+            return frozenset()
+        return self.stream.bits(self.place)
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SignalCandidate(Candidate):
-    """A field that may be the wanted signal; scores are log posteriors [nats].
-
-    Parameters
-    ----------
-    stream : Stream
-        The frames that carry it.
-    place : Place
-    scale, offset : float
-        value = scale × raw + offset, in A, V, % or °C.
-    steps, moves : int
-        Number of changes in the capture, and of those by a share `MOVE` of the range.
-    not_available : int or None
-        Raw code in the capture that means "no value".
-    correlation, resistance_ohm : float
-        With its partner; NaN where there is none.
-    halves_ohm : tuple of float
-        Resistance by the first and by the second half of the capture.
-    partner : str
-    capacity_ah : float
-        Charge of 100 % of a SoC [Ah]; else NaN.
-    """
-
-    HEAD: ClassVar = ("field", "scale", "range", "score", "evidence")
-
-    stream: Stream
-    place: Place
-    scale: float
-    offset: float
-    steps: int
-    moves: int
-    not_available: int | None
-    correlation: float = math.nan
-    resistance_ohm: float = math.nan
-    halves_ohm: tuple[float, float] = (math.nan, math.nan)
-    partner: str = ""
-    capacity_ah: float = math.nan
+    @property
+    def is_fit(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.against
 
     @property
     def is_repeated(self) -> bool:
@@ -152,42 +155,41 @@ class SignalCandidate(Candidate):
 
     @property
     def facts(self) -> str:
-        """The evidence in a phrase."""
+        """What is said for it, in a phrase."""
+        if self.place is None:
+            share = (
+                f"; voltage falls when current rises: {100.0 * self.evidence:.0f} % of its changes"
+            )
+            return f"by name and unit{share * (self.evidence > 0.0)}"
         if self.evidence < 1.0:
             return "smooth; nothing else proves it"
-        r = abs(self.correlation)
+        r = f"correlation {abs(self.correlation):.2f}"
         if self.role == "soc_reference":
-            return f"falls with the charge (correlation {r:.2f}), {self.partner}"
-        text = f"voltage falls when current rises: with {self.partner}, correlation {r:.2f}"
+            return f"falls with the charge ({r}), {self.partner}"
+        text = f"voltage falls when current rises: with {self.partner}, {r}"
         text += f", R {self.resistance_ohm:.2g} Ω"
         return text if self.is_repeated else f"{text}, but not in both halves of the capture"
 
     @property
-    def start(self) -> int:
-        """Start bit as in a DBC."""
-        return self.place.start(self.stream.length)
-
-    @property
-    def bits(self) -> frozenset[tuple[int, bool, int]]:
-        """Its bits, each with its id: a gateway repeats frames on other buses."""
-        return self.stream.bits(self.place)
-
-    @property
-    def name(self) -> str:
-        """Id and bits."""
-        return field_name(self.stream, self.place)
+    def head(self) -> tuple[str, ...]:
+        """Headings of `cells`."""
+        if self.place is None:
+            return "signal, by name and unit", "range", "against it"
+        return "field", "scale", "range", "score", "evidence"
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """Cells of a table under `HEAD`."""
+        """Cells of a table."""
+        if self.place is None:
+            seen = self.range_text or f"by DBC {range_text(*self.holds, self.unit)}"
+            return f"{self.message}\n{self.signal}", seen, "; ".join(self.against)
         return self.name, f"{self.scale:g}", self.range_text, f"{self.score:.1f}", self.facts
 
     def comments(self) -> list[str]:
         """Return the lines that the map states of it: range, evidence, what decided its scale."""
-        lines = [f"{self.name}: {self.range_text}, {self.steps} steps."]
-        lines.append(f"{self.facts[0].upper()}{self.facts[1:]}.")
+        lines = [f"{self.name}: {self.range_text or 'in no capture'}; {self.facts}."]
         factor = f"Factor {self.scale:g} is the"
-        if self.role == "current":
+        if self.place is not None and self.role == "current":
             lines.append(f"{factor} usual one that gives a plausible R; others fit as well.")
             lines.append(f"No current at raw {round(-self.offset / self.scale)}.")
         if others := "; ".join(level.text for level in self.levels[1:]):
@@ -196,27 +198,25 @@ class SignalCandidate(Candidate):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        of = self.stream
-        names = ["scale", "offset", "sign", "steps", "period_s", "score", "evidence", "partner"]
-        names += ["correlation", "resistance_ohm"]
-        return {
-            "id": of.name,
-            "bus": of.bus,
-            "start": self.start,
-            "length": self.place.width,
-            "byte_order": "motorola" if self.place.is_motorola else "intel",
-            "signed": self.place.is_signed,
-            "multiplexer_value": None if of.selector is None else of.selector.value,
-            "range": [self.low, self.high],
-            "halves_ohm": [*self.halves_ohm],
-            **{name: getattr(self, name) for name in names},
+        names = ["message", "signal", "unit", "score", "evidence", "sign", "period_s"]
+        found: dict[str, Any] = {
+            "range": None if math.isnan(self.low) else [self.low, self.high],
+            "against": [*self.against],
+            "not_available": [*self.not_available],
         }
-
-
-def field_name(stream: Stream, place: Place) -> str:
-    """Return id and bits as in a DBC, such as "0x1DB 7|11@0-"."""
-    name = f"{stream.name} {place.text(stream.length)}"
-    return name if stream.selector is None else f"{name} m{stream.selector.value}"
+        if self.stream is not None and self.place is not None:
+            names += ["scale", "offset", "steps", "partner", "correlation", "resistance_ohm"]
+            found |= {
+                "id": self.stream.name,
+                "bus": self.stream.bus,
+                "start": self.place.start(self.stream.length),
+                "length": self.place.width,
+                "byte_order": "motorola" if self.place.is_motorola else "intel",
+                "signed": self.place.is_signed,
+                "multiplexer_value": self.stream.selected,
+                "halves_ohm": [*self.halves_ohm],
+            }
+        return found | {name: getattr(self, name) for name in names}
 
 
 def range_text(low: float, high: float, unit: str, sign: int = 1) -> str:

@@ -30,6 +30,8 @@ _ROLES: Final = {
 }
 """Roles by their names on the command line."""
 _NEEDED: Final = ("current", "voltage")
+_SOC_AGREES: Final = 0.1
+"""Largest relative difference of the capacities that SoC and charge have by two halves."""
 _BUS: Final = ("interface", "channel", "bus_options")
 _SCALE_CURES: Final = {
     "voltage": ("voltage", "Give --nominal-voltage V (by a meter; a type plate is less sure)."),
@@ -194,26 +196,27 @@ def _find(
 ) -> Proposal:
     """Find the signals by the names of a DBC, else by a preset, else by physics."""
     from cangauge.bus.database import load_dbc
-    from cangauge.extras.discovery.by_name import clear_roles, named_signals
+    from cangauge.extras.discovery.by_name import PROVEN, clear_roles, named_signals
     from cangauge.extras.discovery.proposal import Proposal
     from cangauge.extras.discovery.search import search
 
     if dbc is not None:
         remarks: list[str] = []
         named = named_signals(load_dbc(dbc, remarks), _joined(paths), nominal_v)
-        head = ("Signals found by their names and units in the DBC.",)
-        proposal = Proposal("dbc", {**named}, clear_roles(named), head, tuple(remarks), dbc=dbc)
-        proposal.has_steps = any(each.is_followed for each in named["current"])
-        return proposal
+        return Proposal(
+            method="dbc",
+            candidates=named,
+            clear=clear_roles(named),
+            head=("Signals found by their names and units in the DBC.",),
+            remarks=tuple(remarks),
+            dbc=dbc,
+            has_steps=any(each.evidence > PROVEN for each in named["current"]),
+        )
     if presets and (known := _known(paths)) is not None:
         return Proposal("preset", vehicle=known)
     with progress("cangauge.extras.discovery") as show:
         show("reading frames")
-        found = search(_joined(paths), nominal_v)
-    roles = {name: getattr(found, name) for name in (*_NEEDED, "soc_reference")}
-    proposal = Proposal("physics", roles, found.clear, found.comments, found.remarks)
-    proposal.has_steps = found.has_steps
-    return proposal
+        return search(_joined(paths), nominal_v)
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -327,7 +330,7 @@ def _prove(
 
 def _soc_by_charge(log: Log, sign: int) -> dict[str, Any]:
     """Return the capacity that SoC and charge have by each half [Ah], and whether they agree."""
-    from cangauge.extras.discovery.candidate import LEAST_HOURS, SOC_AGREES, is_capacity
+    from cangauge.extras.discovery.candidate import LEAST_HOURS, is_capacity
     from cangauge.logs.charge import implied_capacity
 
     if log.first_soc() is None:
@@ -340,9 +343,9 @@ def _soc_by_charge(log: Log, sign: int) -> dict[str, Any]:
         return {"agrees": False, "why": "it does not move, so that no charge proves it"}
     halves_ah = sorted(sign * half.capacity_ah for half in (first, second))
     std_ah = max(first.std_ah, second.std_ah)
-    least_ah = max(LEAST_HOURS * float(abs(log.current_a).max()), std_ah / SOC_AGREES)
+    least_ah = max(LEAST_HOURS * float(abs(log.current_a).max()), std_ah / _SOC_AGREES)
     agrees = halves_ah[0] >= least_ah and all(map(is_capacity, halves_ah))
-    agrees &= halves_ah[1] <= (1.0 + SOC_AGREES) * halves_ah[0]
+    agrees &= halves_ah[1] <= (1.0 + _SOC_AGREES) * halves_ah[0]
     why = f"by charge, 100 % are {halves_ah[0]:.3g} … {halves_ah[1]:.3g} Ah"
     return {"agrees": bool(agrees), "why": f"{why} in the halves of the capture"}
 
@@ -357,7 +360,7 @@ def _show_candidates(proposal: Proposal) -> None:
                 mark += " ?" if proposal.is_open(role) else " ✓"
             rows.append([mark, *candidate.cells])
         if candidates:
-            print_table(role.replace("_reference", ""), ["", *candidates[0].HEAD], rows)
+            print_table(role.replace("_reference", ""), ["", *candidates[0].head], rows)
     for remark in proposal.remarks:
         note(f"note: {remark}")
 
@@ -374,7 +377,7 @@ def _show(proposal: Proposal, files: Sequence[str], output: Path) -> None:
         note(f"decoded: {proof['samples']} samples of the first capture, {shown}")
     if proposal.method != "physics":
         note(proposal.sign_text)
-    if getattr(proposal.signals.get("current"), "is_wrapped", False):
+    if "current" in proposal.chosen and proposal.signals["current"].is_wrapped:
         note("note: the DBC reads negative currents as large ones; the map has signed = true")
     if why := proposal.proof.get("soc", {}).get("why"):
         note(f"SoC: {why}.")

@@ -11,7 +11,7 @@ import logging
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
@@ -45,15 +45,6 @@ NATURAL: Final = -2.0
 Ints = NDArray[np.int32]
 
 
-@dataclass(frozen=True)
-class Selector:
-    """A multiplexer in Motorola's reading order, and its value in the frames of a stream."""
-
-    first: int
-    width: int
-    value: int
-
-
 @dataclass(eq=False)
 class Stream:
     """Frames of one id on one bus, all of one length and one multiplexer value.
@@ -65,7 +56,10 @@ class Stream:
     is_extended : bool
     time_s : array (n,)
     payload : array (n, length) of uint8
-    selector : Selector, optional
+    selector : Place, optional
+        The multiplexer.
+    selected : int, optional
+        Its value in these frames.
     """
 
     bus: str
@@ -73,7 +67,8 @@ class Stream:
     is_extended: bool
     time_s: FloatArray
     payload: NDArray[np.uint8]
-    selector: Selector | None = None
+    selector: Place | None = None
+    selected: int | None = None
 
     @property
     def length(self) -> int:
@@ -260,15 +255,14 @@ def _demultiplexed(stream: Stream) -> list[Stream]:
     _, first, width = best
     codes = _codes(bits, first, width)
     return [
-        Stream(
-            stream.bus,
-            stream.arbitration_id,
-            stream.is_extended,
-            stream.time_s[codes == value],
-            stream.payload[codes == value],
-            Selector(first, width, int(value)),
+        replace(
+            stream,
+            time_s=stream.time_s[codes == value],
+            payload=stream.payload[codes == value],
+            selector=Place(True, first, first + width - 1, False),
+            selected=value,
         )
-        for value in np.unique(codes)
+        for value in np.unique(codes).tolist()
     ]
 
 

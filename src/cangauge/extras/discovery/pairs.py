@@ -21,12 +21,10 @@ from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.discovery.candidate import (
     MOST_A,
     MOST_SAG,
-    MOVE,
     ROLES,
     SHOWN,
+    Candidate,
     Level,
-    SignalCandidate,
-    field_name,
 )
 from cangauge.extras.discovery.fields import Field, Ints, Place, Stream, most_common
 
@@ -178,8 +176,8 @@ class Row:
 
     @property
     def moves(self) -> int:
-        """Number of changes by a share `MOVE` of the range, at once or little by little."""
-        least = MOVE * float(np.ptp(self.values))
+        """Number of changes by a tenth of the range, at once or little by little."""
+        least = 0.1 * float(np.ptp(self.values))
         count, from_ = 0, self.values[0]
         for value in self.values[1:].tolist():
             if abs(value - from_) >= least:
@@ -198,17 +196,25 @@ class Row:
         """Its bits, each with its id: a gateway repeats frames on other buses."""
         return self.field.stream.bits(self.place)
 
-    def candidate(self, role: str, scale: float, offset: float, **more: Any) -> SignalCandidate:
+    @property
+    def name(self) -> str:
+        """Id and bits as in a DBC, such as "0x1DB 7|11@0-"."""
+        of = self.field.stream
+        name = f"{of.name} {self.place.text(of.length)}"
+        return name if of.selector is None else f"{name} m{of.selected}"
+
+    def candidate(self, role: str, scale: float, offset: float, **more: Any) -> Candidate:
         """Return the field as the signal of a role."""
         stream, place = self.field.stream, self.place
         ends = scale * np.array([self.values.min(), self.values.max()], np.float64) + offset
-        code: int | None = None
         gone = self.field.raw[self.field.missing & (self.field.raw != 0)]
-        if len(gone):
-            codes, counts = np.unique(gone, return_counts=True)
-            code = int(codes[counts.argmax()]) if place.is_signed else (1 << place.width) - 1
-        return SignalCandidate(
+        codes, counts = np.unique(gone, return_counts=True)
+        code = codes[counts == counts.max(initial=0)][:1].tolist()
+        if code and not place.is_signed:
+            code = [(1 << place.width) - 1]
+        return Candidate(
             role=role,
+            name=self.name,
             message=f"FRAME_{stream.arbitration_id:X}",
             signal=ROLES[role].column,
             unit=ROLES[role].unit,
@@ -221,7 +227,7 @@ class Row:
             offset=offset,
             steps=self.steps,
             moves=self.moves,
-            not_available=code,
+            not_available=tuple(code),
             levels=self.levels,
             **more,
         )
@@ -388,10 +394,10 @@ class Pairs:
                     found[number] |= bool(both > 0.95)
         return found
 
-    def best(self) -> tuple[list[SignalCandidate], list[SignalCandidate], Row | None]:
+    def best(self) -> tuple[list[Candidate], list[Candidate], Row | None]:
         """Return the best candidates for current and voltage, and the row of the first current."""
-        currents: list[SignalCandidate] = []
-        voltages: list[SignalCandidate] = []
+        currents: list[Candidate] = []
+        voltages: list[Candidate] = []
         chosen: Row | None = None
         bits: tuple[set[Any], set[Any]] = (set(), set())
         for place in np.argsort(-self.score, axis=None)[: 200 * 200].tolist():
@@ -411,7 +417,7 @@ class Pairs:
                     found.append(each)
         return currents[:SHOWN], voltages[:SHOWN], chosen
 
-    def _candidates(self, a: int, b: int) -> tuple[SignalCandidate, SignalCandidate]:
+    def _candidates(self, a: int, b: int) -> tuple[Candidate, Candidate]:
         """Return the current and the voltage of a pair."""
         u, i, r = self._voltages[a], self._currents[b], float(self.r[a, b])
         amps = float(self.current_scale[a, b])
@@ -427,10 +433,9 @@ class Pairs:
             ends = float(i.values.min()), float(i.values.max())
             zeros = np.array(round_zeros(*ends, i.place.width) or [0.0])
             zero = float(zeros[np.abs(zeros - most_common(i.values)).argmin()])
-        names = [field_name(row.field.stream, row.place) for row in (u, i)]
         sign = 1 if r < 0.0 else -1
-        current = i.candidate("current", amps, -amps * zero, sign=sign, partner=names[0], **facts)
-        return current, u.candidate("voltage", u.level.scale, 0.0, partner=names[1], **facts)
+        current = i.candidate("current", amps, -amps * zero, sign=sign, partner=u.name, **facts)
+        return current, u.candidate("voltage", u.level.scale, 0.0, partner=i.name, **facts)
 
     def _halves(self, a: int, b: int) -> list[float]:
         """Return dU/dI by each half of the capture, in raw numbers; discharge gives R > 0."""
@@ -468,10 +473,10 @@ def _guess(widths: Ints, away: FloatArray) -> FloatArray:
     return np.asarray(scales[prior.argmax(0), 0])
 
 
-def _are_siblings(one: SignalCandidate, two: SignalCandidate) -> bool:
+def _are_siblings(one: Candidate, two: Candidate) -> bool:
     """Whether two candidates are cells in one message: raw numbers alike, but for cut bits."""
     middles = [(each.low + each.high) / 2.0 / each.scale for each in (one, two)]
-    if one.stream.name != two.stream.name or min(one.low, two.low) <= 0.0:
+    if one.message != two.message or min(one.low, two.low) <= 0.0:
         return False
     octaves = math.log2(middles[0] / middles[1])
     return abs(octaves - round(octaves)) < SIBLING

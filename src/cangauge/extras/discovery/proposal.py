@@ -11,8 +11,7 @@ from typing import Any, Final, Literal
 
 from cangauge._text import printable
 from cangauge.bus.vehicle import EXTENDED, PRESETS
-from cangauge.extras.discovery.by_name import NamedSignal
-from cangauge.extras.discovery.candidate import ROLES, Level, SignalCandidate
+from cangauge.extras.discovery.candidate import ROLES, Candidate, Level
 
 FALLBACK_C: Final = 20.0
 """Temperature of a map without one [°C]: the reference temperature of the voltage model."""
@@ -46,7 +45,7 @@ class Proposal:
     """
 
     method: Literal["preset", "dbc", "physics"]
-    candidates: dict[str, Sequence[SignalCandidate | NamedSignal]] = field(default_factory=dict)
+    candidates: dict[str, list[Candidate]] = field(default_factory=dict)
     clear: Collection[str] = ()
     head: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -57,7 +56,7 @@ class Proposal:
     proof: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def signals(self) -> dict[str, SignalCandidate | NamedSignal]:
+    def signals(self) -> dict[str, Candidate]:
         """Chosen candidates by role."""
         return {role: self.candidates[role][number] for role, number in self.chosen.items()}
 
@@ -131,8 +130,7 @@ class Proposal:
         """
         texts = {"run.toml": self._config(**bus)}
         if self.vehicle is None:
-            fields = [each for each in self.signals.values() if isinstance(each, SignalCandidate)]
-            maps = {} if self.dbc is not None else {"car.dbc": _dbc_text(fields)}
+            maps = {} if self.dbc is not None else {"car.dbc": _dbc_text([*self.signals.values()])}
             texts = {**maps, "car.toml": "\n".join([*self._map_lines(folder), ""]), **texts}
         return texts
 
@@ -180,7 +178,7 @@ pair_within_s = {pair_s:.3g}  # current and voltage at most this far apart make 
 [temperature]
 fixed_c = {FALLBACK_C:g}"""
 
-    def _signal_lines(self, role: str, signal: SignalCandidate | NamedSignal) -> Iterator[str]:
+    def _signal_lines(self, role: str, signal: Candidate) -> Iterator[str]:
         others = [each.name for each in self.candidates[role] if each is not signal]
         yield from map(_comment, signal.comments())
         if others:
@@ -191,9 +189,9 @@ fixed_c = {FALLBACK_C:g}"""
         if role == "current":
             way = "positive current discharges" if signal.sign > 0 else "negative discharges"
             yield f"sign = {signal.sign}  # {way if self.is_sign_proven else 'not proven'}"
-        if isinstance(signal, NamedSignal) and signal.is_wrapped:
+        if signal.is_wrapped:
             yield "signed = true  # the DBC reads negative values as large ones"
-        if isinstance(signal, NamedSignal) and signal.not_available:
+        if signal.not_available and self.dbc is not None:
             yield f"not_available = {list(signal.not_available)}  # at an end of its codes"
 
     def _config(
@@ -238,30 +236,34 @@ def _comment(text: str) -> str:
     return f"# {' '.join(printable(text).splitlines())}"
 
 
-def _dbc_text(chosen: Sequence[SignalCandidate]) -> str:
+def _dbc_text(chosen: Sequence[Candidate]) -> str:
     """Return a DBC with the chosen fields."""
-    by_id: dict[int, list[SignalCandidate]] = {}
+    messages: dict[str, list[str]] = {}
+    values, cycles = [], []
     for each in chosen:
-        key = each.stream.arbitration_id | (EXTENDED if each.stream.is_extended else 0)
-        by_id.setdefault(key, []).append(each)
-    messages, values, cycles = [], [], []
-    for key, own in by_id.items():
-        messages.append(f"BO_ {key} {own[0].message}: {own[0].stream.length} Vehicle")
-        if (selector := own[0].stream.selector) is not None:
-            start = 8 * (selector.first // 8) + 7 - selector.first % 8
-            messages.append(f' SG_ selector M : {start}|{selector.width}@0+ (1,0) [0|0] "" Vehicle')
-        for each in own:
-            mark = "" if each.stream.selector is None else f" m{each.stream.selector.value}"
-            messages.append(
-                f" SG_ {each.signal}{mark} : {each.place.text(each.stream.length)}"
-                f" ({each.scale:.10g},{each.offset + 0.0:.10g}) [0|0]"
-                f' "{each.unit.replace("°", "deg")}" Vehicle'
-            )
-            if each.not_available is not None:
-                values.append(f'VAL_ {key} {each.signal} {each.not_available} "not available" ;')
-        messages.append("")
-        period_ms = max(round(1e3 * own[0].period_s), 1)
-        cycles.append(f'BA_ "GenMsgCycleTime" BO_ {key} {period_ms};')
-    parts = ['VERSION "1"\n\nNS_ :\n\nBS_:\n\nBU_: Vehicle\n', *messages]
-    parts += ['BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;', 'BA_DEF_DEF_ "GenMsgCycleTime" 0;']
-    return "\n".join([*parts, *cycles, "", *values, ""])
+        of, place = each.stream, each.place
+        if of is None or place is None:
+            continue
+        key = of.arbitration_id | (EXTENDED if of.is_extended else 0)
+        head = f"BO_ {key} {each.message}: {of.length} Vehicle"
+        mark = ""
+        if (selector := of.selector) is not None:
+            mark = f" m{of.selected}"
+            bits = selector.text(of.length)
+            head += f'\n SG_ selector M : {bits} (1,0) [0|0] "" Vehicle'
+        if head not in messages:
+            period_ms = max(round(1e3 * of.period_s), 1)
+            cycles.append(f'BA_ "GenMsgCycleTime" BO_ {key} {period_ms};')
+        messages.setdefault(head, []).append(
+            f" SG_ {each.signal}{mark} : {place.text(of.length)}"
+            f" ({each.scale:.10g},{each.offset + 0.0:.10g}) [0|0]"
+            f' "{each.unit.replace("°", "deg")}" Vehicle'
+        )
+        values += [
+            f'VAL_ {key} {each.signal} {code} "not available" ;' for code in each.not_available
+        ]
+    lines = ['VERSION "1"\n\nNS_ :\n\nBS_:\n\nBU_: Vehicle\n']
+    for head, signals in messages.items():
+        lines += [head, *signals, ""]
+    lines += ['BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;', 'BA_DEF_DEF_ "GenMsgCycleTime" 0;']
+    return "\n".join([*lines, *cycles, "", *values, ""])

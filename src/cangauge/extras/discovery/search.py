@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from operator import attrgetter
 from typing import Final
@@ -21,10 +21,9 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import (
     LEAST_HOURS,
-    MOVES,
     SHOWN,
+    Candidate,
     Level,
-    SignalCandidate,
     is_capacity,
 )
 from cangauge.extras.discovery.fields import Field, Stream, collect, fields_of
@@ -36,6 +35,7 @@ from cangauge.extras.discovery.pairs import (
     Row,
     round_zeros,
 )
+from cangauge.extras.discovery.proposal import Proposal
 from cangauge.logs.sign import correlation
 
 VOLTAGE_SCALES: Final = {
@@ -62,7 +62,9 @@ MOST_CURRENTS: Final = 4000
 MOST_VOLTAGES: Final = 1500
 """Most fields whose pairs are tried: 50 MB for each of a dozen quantities."""
 ENOUGH_NATS: Final = 3.0
-"""Evidence from current steps that is needed to decide without the user: as above."""
+"""Evidence from current steps that is needed to decide without the user: as below."""
+MOVES: Final = 5
+"""Steps of a current, each a tenth of its range, without which nothing proves it."""
 CLEARLY_NATS: Final = 3.0
 """Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
 RIVAL: Final = 0.6
@@ -81,66 +83,8 @@ MOST_FRAMES: Final = 1_000_000
 """Frames that are looked at, all ids over one time: 5–15 minutes of a car, hours of a module."""
 
 
-Candidates = list[SignalCandidate]
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Candidates by role, best first, and what the capture cannot show.
-
-    Parameters
-    ----------
-    current, voltage, soc_reference : list of SignalCandidate
-    remarks : tuple of str
-    streams, fields : int
-        Number of ids and of numbers looked at.
-    duration_s : float
-    """
-
-    current: Candidates
-    voltage: Candidates
-    soc_reference: Candidates
-    remarks: tuple[str, ...]
-    streams: int
-    fields: int
-    duration_s: float
-
-    @property
-    def comments(self) -> tuple[str, ...]:
-        """What was looked at and not found, for the head of a map."""
-        found = f"Found by physics in {self.duration_s:.0f} s of frames: {self.fields} numbers of"
-        return (
-            f"{found} {self.streams} ids.",
-            *self.remarks,
-            "The bits do not determine the factors: compare voltage and current with a",
-            "meter or the car's display, and correct factor and offset in the DBC.",
-        )
-
-    @property
-    def has_steps(self) -> bool:
-        """Whether a voltage follows steps of a current."""
-        return any(each.evidence >= ENOUGH_NATS and each.moves >= MOVES for each in self.current)
-
-    @property
-    def clear(self) -> list[str]:
-        """Roles whose first candidate is taken without the user; a SoC that falls always is."""
-        pair = [role for role in ("current", "voltage") if self.is_clear(role)]
-        return [*pair, "soc_reference"] if self.soc_reference else pair
-
-    def is_clear(self, role: str) -> bool:
-        """Whether the first candidate is certain enough to be taken without the user."""
-        found: Candidates = getattr(self, role)
-        if not found or not (found[0].evidence >= ENOUGH_NATS and found[0].is_repeated):
-            return False
-        if found[0].moves < MOVES:
-            return False
-        if any(each.evidence > RIVAL * found[0].evidence for each in found[1:]):
-            return False  # the inverter's pair and the pack's: both obey the same physics
-        return len(found) == 1 or found[0].score - found[1].score >= CLEARLY_NATS
-
-
-def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> Findings:
-    """Find current, voltage and SoC in the frames of a capture.
+def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> Proposal:
+    """Return the candidates for current, voltage and SoC in the frames of a capture.
 
     Parameters
     ----------
@@ -174,14 +118,41 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
         remarks.append("no field falls with the charge: record a longer drive to find the SoC")
     if next(frames, None) is not None:
         remarks.append(f"ranges and steps are those of the first {duration(grid.duration_s)}")
-    return Findings(
-        current, voltage, soc, tuple(remarks), len(streams), len(fields), grid.duration_s
+    seen = f"{grid.duration_s:.0f} s of frames: {len(fields)} numbers of {len(streams)} ids"
+    found = {"current": current, "voltage": voltage, "soc_reference": soc}
+    return Proposal(
+        method="physics",
+        candidates=found,
+        clear=[role for role, of in found.items() if of and (of is soc or _is_clear(of))],
+        head=(
+            f"Found by physics in {seen}.",
+            *remarks,
+            "The bits do not determine the factors: compare voltage and current with a",
+            "meter or the car's display, and correct factor and offset in the DBC.",
+        ),
+        remarks=tuple(remarks),
+        has_steps=any(map(_is_proven, current)),
     )
+
+
+def _is_proven(candidate: Candidate) -> bool:
+    """Return whether the voltage follows steps of the current."""
+    return candidate.evidence >= ENOUGH_NATS and candidate.moves >= MOVES
+
+
+def _is_clear(found: list[Candidate]) -> bool:
+    """Return whether the first candidate is certain enough to be taken without the user."""
+    first, *others = found
+    if not (_is_proven(first) and first.is_repeated):
+        return False
+    if any(each.evidence > RIVAL * first.evidence for each in others):
+        return False  # the inverter's pair and the pack's: both obey the same physics
+    return not others or first.score - others[0].score >= CLEARLY_NATS
 
 
 def _pair(
     fields: Sequence[Field], grid: Grid, nominal_v: float | None
-) -> tuple[Candidates, Candidates, Row | None]:
+) -> tuple[list[Candidate], list[Candidate], Row | None]:
     """Return the candidates for current and voltage, and the field of the first current."""
     currents = [row for field in fields if (row := _as_current(field))]
     voltages = [row for field in fields if (row := _as_voltage(field, nominal_v))]
@@ -190,25 +161,33 @@ def _pair(
     # All pairs are held in memory: of the largest buses, the likelier fields.
     currents = sorted(currents, key=attrgetter("prior"), reverse=True)[:MOST_CURRENTS]
     voltages = sorted(voltages, key=attrgetter("prior"), reverse=True)[:MOST_VOLTAGES]
-    current, voltage, row = Pairs(voltages, currents, grid).best()
-    return ([], [], None) if row is None else (current, voltage, row)
+    return Pairs(voltages, currents, grid).best()
 
 
 def _socs(
     fields: Sequence[Field],
     grid: Grid,
-    current: SignalCandidate,
-    voltage: SignalCandidate,
+    current: Candidate,
+    voltage: Candidate,
     row: Row,
-) -> Candidates:
+) -> list[Candidate]:
     """Return the candidates for SoC, by the charge of a current."""
     amps = current.sign * (current.scale * row.means_on(grid) + current.offset)
     span = grid.longest(0.5 * BETWEEN_S)
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
     least_ah = LEAST_HOURS * float(np.abs(amps).max())
-    found = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
-    possible = [each for each in found if each.capacity_ah >= least_ah]
-    return _apart(possible, current.bits | voltage.bits)
+    found = (
+        _as_charge(
+            field, grid.means(field.stream, field.raw, field.missing)[span], drawn_ah, least_ah
+        )
+        for field in fields
+    )
+    taken, kept = current.bits | voltage.bits, []
+    for each in sorted(filter(None, found), key=attrgetter("score"), reverse=True):
+        if not each.bits & taken:  # a field of a better one
+            kept.append(each)
+            taken |= each.bits
+    return kept[:SHOWN]
 
 
 def _as_current(field: Field) -> Row | None:
@@ -289,13 +268,12 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
 
 
 def _as_charge(
-    field: Field, grid: Grid, drawn_ah: FloatArray, span: slice
-) -> SignalCandidate | None:
-    """Return a field as a SoC, if it falls as the charge is drawn."""
+    field: Field, values: FloatArray, drawn_ah: FloatArray, least_ah: float
+) -> Candidate | None:
+    """Return a field as a SoC, if it falls as the charge is drawn; `values` by slot of time."""
     seen = field.statistics
     if field.best.place.is_signed or seen.distinct < 4:
         return None
-    values = grid.means(field.stream, field.raw, field.missing)[span]
     spread, moved = float(np.std(values)), float(np.std(drawn_ah))
     r = correlation(values, drawn_ah)
     if r > -0.95:
@@ -313,9 +291,9 @@ def _as_charge(
                 meant = Level(scale, high, text)
                 readings.append(Row(field, place, constant, field.missing, score, meant))
     row = _likeliest(readings, by_scale=True)
-    if row is None:
+    capacity_ah = 100.0 * moved / (spread * row.level.scale) if row else 0.0
+    if row is None or capacity_ah < least_ah:
         return None
-    capacity_ah = 100.0 * moved / (spread * row.level.scale)
     return row.candidate(
         "soc_reference",
         row.level.scale,
@@ -324,7 +302,6 @@ def _as_charge(
         evidence=evidence,
         correlation=r,
         partner=f"{capacity_ah:.0f} Ah per 100 %",
-        capacity_ah=capacity_ah,
     )
 
 
@@ -350,13 +327,3 @@ def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None
 def _step(value: float, priors: Mapping[float, float]) -> float:
     """Return the prior of the first bound that a value does not exceed."""
     return next(prior for bound, prior in priors.items() if value <= bound)
-
-
-def _apart(found: Candidates, taken: frozenset[tuple[int, bool, int]]) -> Candidates:
-    """Return the best candidates, without those that share bits with a better one."""
-    kept: Candidates = []
-    for each in sorted(found, key=attrgetter("score"), reverse=True):
-        if not each.bits & taken:
-            kept.append(each)
-            taken |= each.bits
-    return kept[:SHOWN]
