@@ -318,12 +318,13 @@ _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
 
 @contextmanager
 def atomic_path(path: str | PathLike[str], rights: int = 0o666) -> Iterator[Path]:
-    """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
+    """Yield a path for the content of `path`, which is replaced when the block succeeds.
 
-    If the block raises, `path` is unchanged. The content is synced to disk before the rename: a
-    power cut leaves the old file or the new one. A new file gets `rights` less the umask, an own
-    one keeps its rights. Links are followed as by `written_name`. A device or pipe (`/dev/stdout`)
-    cannot be replaced and is yielded itself.
+    The yielded path leads to an open file (`/dev/fd/7`) and has no suffix. If the block raises,
+    `path` is unchanged. The content is synced to disk before the rename: a power cut leaves the old
+    file or the new one. A new file gets `rights` less the umask, an own one keeps its rights. Links
+    are followed as by `written_name`. A device or pipe (`/dev/stdout`) cannot be replaced and is
+    yielded itself.
 
     Raises
     ------
@@ -336,10 +337,17 @@ def atomic_path(path: str | PathLike[str], rights: int = 0o666) -> Iterator[Path
     if is_device(target):
         yield target
         return
-    part = _create_beside(target, path, rights)
+    part, descriptor = _create_beside(target, path, rights)
     try:
-        yield part
-        _sync(part, target)
+        with os.fdopen(descriptor, "rb+"):
+            # The open file, whose name another user of the folder could exchange for a link.
+            opened = Path(f"/dev/fd/{descriptor}")
+            yield opened if opened.exists() else part
+            _sync(descriptor, target)
+            info = os.fstat(descriptor)
+        if not has_name(info, part):
+            problem, cure = "another user has exchanged it meanwhile", "name another folder"
+            raise InputError(problem, source=path, cure=cure)
         part.replace(target)
     except OSError as error:
         if error.errno not in FULL:
@@ -347,7 +355,8 @@ def atomic_path(path: str | PathLike[str], rights: int = 0o666) -> Iterator[Path
         problem = f"{path}: writing failed: {error.strerror}; free some space"
         raise CangaugeError(problem) from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink()
 
 
 def remove_parts(path: str | PathLike[str]) -> None:
@@ -405,21 +414,31 @@ def _is_trusted(link: Path, *, is_folder: bool) -> bool:
     return is_own(info) or (is_folder and info.st_uid == link.parent.stat().st_uid)
 
 
-def _create_beside(target: Path, shown: str | PathLike[str], rights: int = 0o666) -> Path:
-    # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
+def has_name(info: os.stat_result, path: Path) -> bool:
+    """Return whether an open file still has this name."""
+    try:
+        return os.path.samestat(info, path.lstat())
+    except FileNotFoundError:
+        return False
+
+
+def _create_beside(
+    target: Path, shown: str | PathLike[str], rights: int = 0o666
+) -> tuple[Path, int]:
+    """Return a new temporary file beside the target, and its descriptor."""
     part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
         if target.is_dir() and not target.is_symlink():
             raise InputError("this is a folder", source=shown, cure="name a file in it")
         if os.path.lexists(target) and _is_kept_by_another(target):
             raise InputError("another user has made it", source=shown, cure="name another file")
-        part.touch(0o600 if target.exists() else rights, exist_ok=False)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
+        return part, os.open(part, flags, 0o600 if target.exists() else rights)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(
             error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")
         )
         raise InputError(problem, source=shown, cure=cure) from error
-    return part
 
 
 def _is_kept_by_another(name: Path) -> bool:
@@ -429,15 +448,12 @@ def _is_kept_by_another(name: Path) -> bool:
     return is_sticky and os.geteuid() not in {0, info.st_uid, folder.st_uid}
 
 
-def _sync(part: Path, target: Path) -> None:
+def _sync(written: int, target: Path) -> None:
     """Sync a written file to disk, with the rights of the own file that it replaces."""
-    written = os.open(part, os.O_RDONLY | NO_LINK)
-    try:
-        os.fsync(written)
-        if target.is_file() and not target.is_symlink() and is_own(target.stat()):
-            part.chmod(stat.S_IMODE(target.stat().st_mode))
-    finally:
-        os.close(written)
+    os.fsync(written)
+    is_kept = target.is_file() and not target.is_symlink() and is_own(target.stat())
+    if is_kept and os.chmod in os.supports_fd:
+        os.chmod(written, stat.S_IMODE(target.stat().st_mode))
 
 
 def is_device(path: Path) -> bool:
@@ -467,7 +483,9 @@ def check_writable(path: str | PathLike[str]) -> None:
     """Raise the InputError that writing `path` would raise, before any long work is done."""
     target = written_name(path)
     if not is_device(target):
-        _create_beside(target, path).unlink()
+        part, descriptor = _create_beside(target, path)
+        os.close(descriptor)
+        part.unlink()
 
 
 def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> None:

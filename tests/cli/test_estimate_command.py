@@ -140,7 +140,7 @@ def test_a_refused_sample_keeps_its_own_time(part: Log) -> None:
     wild = replace(log, current_a=np.where(np.arange(50) == 20, 1e5, log.current_a))
     table, _ = estimate_log(wild, Model.load("model.json"), EstimatorSettings())
     assert table.time_s[20] == log.time_s[19]
-    write_estimates(Path("soc.parquet"), wild.time_s, table)
+    write_estimates(Path("soc.parquet"), wild.time_s, table, is_parquet=True)
     written = read_table("soc.parquet")
     assert written["time_s"].to_numpy().tolist() == log.time_s.tolist()
     assert "implausible input" in written["reasons"][20].as_py()

@@ -135,7 +135,7 @@ def test_a_service_that_fails(
 
 
 def test_a_disk_that_is_full(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         with atomic_path(tmp_path / "soc.csv"):
             raise OSError(28, "No space left on device")
 

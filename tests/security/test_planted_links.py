@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge._files import write_text_atomic
+from cangauge._files import atomic_path, write_text_atomic
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
@@ -134,6 +134,29 @@ def test_a_link_to_itself_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.txt").symlink_to("x.txt")
     with pytest.raises(InputError, match="a link to itself"):
         write_text_atomic(tmp_path / "x.txt", "text")
+
+
+@pytest.mark.parametrize("rights", [0o1777, 0o777])
+def test_an_exchanged_temporary_file_is_not_written_through(rights: int, tmp_path: Path) -> None:
+    mine, folder = tmp_path / "mine", tmp_path / "folder"
+    mine.write_text("mine")
+    mine.chmod(0o600)
+    folder.mkdir()
+    folder.chmod(rights)
+    (folder / "x.txt").touch(0o644)
+
+    def write() -> None:
+        with atomic_path(folder / "x.txt") as part:
+            (temporary,) = folder.glob(".x*")
+            temporary.unlink()
+            planted(temporary, mine)
+            part.write_text("text")
+
+    with pytest.raises(InputError, match="another user has exchanged it"):
+        write()
+    assert mine.read_text() == "mine"
+    assert mine.stat().st_mode & 0o777 == 0o600
+    assert [each.name for each in folder.iterdir()] == ["x.txt"]
 
 
 def as_victim(work: Callable[[], None]) -> int:

@@ -142,12 +142,13 @@ def estimate_command(
     )
     page = extra("report.estimate:estimate_page")(done, model).html() if report else ""
     with ExitStack() as all_of_them:
-        parts = {what: all_of_them.enter_context(atomic_path(p)) for what, p in files.items() if p}
-        write_estimates(parts["output"], done.recorded.time_s, done.table)
-        if pack is not None:
-            write_table(pack_columns(done.pack_rows), parts["pack"])
+        is_parquet = output.suffix.lower() == ".parquet"
+        part = all_of_them.enter_context(atomic_path(output))
+        write_estimates(part, done.recorded.time_s, done.table, is_parquet=is_parquet)
         if report is not None:
-            parts["report"].write_text(page, encoding="utf-8")
+            all_of_them.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
+        if pack is not None:
+            write_table(pack_columns(done.pack_rows), pack)
     for warning in done.warnings:
         remark(f"warning: {done.recorded.source}: {warning}")
     logs = [done.recorded] if isinstance(done.recorded, Log) else []
@@ -173,8 +174,10 @@ def estimate_file(
     return estimate(path, model, settings, reading, keeps_pack=keeps_pack)
 
 
-def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:
-    """Write one row per sample, as CSV or Parquet by the suffix; a device gets CSV.
+def write_estimates(
+    path: Path, time_s: FloatArray, table: EstimateTable, *, is_parquet: bool
+) -> None:
+    """Write one row per sample, as CSV or Parquet.
 
     `time_s` are the samples' own times [s]: a refused sample's estimate is the one before. An
     unknown value becomes empty (CSV) or null (Parquet).
@@ -183,7 +186,7 @@ def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> Non
     import pyarrow.parquet as pq
 
     columns = replace(table, time_s=time_s).to_arrow()
-    if path.suffix.lower() == ".parquet":
+    if is_parquet:
         pq.write_table(columns, path)
         return
     with path.open("wb") as file:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import BinaryIO, Self
 
-from cangauge._files import NO_LINK, is_own, written_name
+from cangauge._files import NO_LINK, has_name, is_own, written_name
 from cangauge._text import printable
 from cangauge.errors import InputError
 
@@ -131,19 +131,12 @@ def _locked(lock: Path, shown: str | PathLike[str]) -> BinaryIO:
                     cure="stop that one, or name another file",
                 ) from error
             # Its holder removes the name before the lock ends: then it is made anew.
-            if _has_name(info, lock):
+            if has_name(info, lock):
                 closing.pop_all()
                 with suppress(OSError):  # a full disk: without the process in messages
                     file.truncate(0)
                     file.write(str(os.getpid()).encode())
                 return file
-
-
-def _has_name(info: os.stat_result, path: Path) -> bool:
-    try:
-        return os.path.samestat(info, path.lstat())
-    except FileNotFoundError:
-        return False
 
 
 class Notifier:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from cangauge._files import atomic_path, write_texts_atomic
+from cangauge._files import atomic_path
 from cangauge._text import number, printable
 from cangauge.cli.options import (
     CAPACITY_AH,
@@ -130,9 +130,10 @@ def judge_command(
 
         texts[report] = judge_page(judgement, model).html()
     with ExitStack() as both:
+        for path, text in texts.items():
+            both.enter_context(atomic_path(path)).write_text(text, encoding="utf-8", newline="\n")
         if corrected is not None:
-            _write_corrected(both.enter_context(atomic_path(corrected)), judgement)
-        write_texts_atomic(texts)
+            _write_corrected(corrected, judgement)
     result = judgement.to_dict(None if corrected is None else str(corrected))
     written = [path for path in (output, corrected, report) if path is not None]
     finish(result, partial(_show, judgement, written), as_json=json_output)
