@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import gzip
+import struct
 import time
+import tracemalloc
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from cangauge._files import MIB
 from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.readers import capture_readers
@@ -43,6 +47,14 @@ def nested_multiplexers(depth: int = 12) -> bytes:
     return "".join([head, *signals, *values]).encode()
 
 
+def packed_container(size: int) -> bytes:
+    """Return a BLF with one container of zeros."""
+    packed = zlib.compress(bytes(size), 9)
+    head = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(packed), 10)
+    container = struct.pack("<H6xL4x", 2, size) + packed
+    return b"LOGG" + struct.pack("<L", 144) + bytes(136) + head + container
+
+
 LOG = table("time_s", "current_a", "voltage_v", "temperature_c")
 FILES: dict[str, bytes] = {
     "nothing": b"",
@@ -66,6 +78,8 @@ FILES: dict[str, bytes] = {
     "many commas": (b"," * 60_000 + b"\n") * 20,
     "frames without ends": b"(1.0) can0 123#" + b"00" * (1 << 21),
     "multiplexers": nested_multiplexers(),
+    "attributes": b'VERSION ""\nBU_: E\n' + b'BA_DEF_ BO_ "A" INT 0 1;\n' * 150_000,
+    "a large container": packed_container(1 << 30),
     "packed twice": gzip.compress(gzip.compress(LOG)),
     "a packed table": gzip.compress(wide("c{}")),
 }
@@ -137,3 +151,13 @@ def test_a_command_refuses_a_link_to_itself(tmp_path: Path) -> None:
     for command in (("inspect", path), ("fit", path, "-o", tmp_path / "m.json"), ("gap", path)):
         ended = in_process(*command)
         assert (ended.code, len(ended.err.splitlines())) == (2, 1), ended.err
+
+
+def test_no_container_is_unpacked_whole(tmp_path: Path) -> None:
+    path = tmp_path / "x.blf"
+    path.write_bytes(packed_container(512 * MIB))
+    tracemalloc.start()
+    assert "a container of more than" in refusal(a_capture, path)
+    _, highest = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert highest < 200 * MIB

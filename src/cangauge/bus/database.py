@@ -403,7 +403,7 @@ def load_dbc(path: str | PathLike[str], remarks: list[str] | None = None) -> Dat
         text = data.decode("cp1252", errors="replace")  # the encoding that most tools write
     try:
         text, changes = prepared(text, path)
-        if re.search(r"\bBO_\s", text) is None:  # another text takes as long to parse as a DBC
+        if re.search(r"\bBO_\s+\d", text) is None:  # another text takes as long to parse as a DBC
             raise ValueError("it has no message (BO_)")  # noqa: TRY301 - reported as others are
         database = cantools.database.load_string(text, "dbc", strict=False)
     except (

@@ -5,21 +5,26 @@ from __future__ import annotations
 import io
 import re
 import struct
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Generator, Iterator
 from importlib.util import find_spec
 from itertools import chain
 from typing import Any, ClassVar, Final
 
 import can
+from can.io import blf
 from can.io.blf import BLFParseError
 from can.util import dlc2len
 
+from cangauge._files import MIB
 from cangauge._text import counted
 from cangauge.bus.readers import MAX_LINE, BinaryReader
 from cangauge.errors import InputError
 
 _OBJECT: Final = struct.Struct("<8sI4x")
 """Header of an object in a BLF, with its size [bytes]."""
+MAX_CONTAINER: Final = 64 * MIB
+"""Largest container of a BLF, unpacked [bytes]; loggers write 128 kB."""
 
 
 class LibraryReader(BinaryReader):
@@ -114,12 +119,35 @@ class _InPieces:
 
 
 class _EndingBlf(can.BLFReader):
-    """python-can's reader; it would read an object whose size leads to no next one for ever."""
+    """python-can's reader, with limits to what it unpacks at once and to how it goes on.
+
+    It would unpack a container of any size, and read an object whose size leads to no next one for
+    ever.
+    """
 
     objects = 0
 
     def __init__(self, raw: Any) -> None:
         super().__init__(_InPieces(raw))  # type: ignore[arg-type]
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        while head := self.file.read(blf.OBJ_HEADER_BASE_STRUCT.size):
+            mark, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack(head)
+            if mark != b"LOBJ":
+                raise BLFParseError("no object")
+            data = self.file.read(size - len(head))
+            self.file.read(size % 4)
+            if kind != blf.LOG_CONTAINER:
+                continue
+            method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(data)
+            data = data[blf.LOG_CONTAINER_STRUCT.size :]
+            if method == blf.ZLIB_DEFLATE:
+                unpacking = zlib.decompressobj()
+                data = unpacking.decompress(data, MAX_CONTAINER)
+                if unpacking.unconsumed_tail:
+                    raise BLFParseError(f"a container of more than {MAX_CONTAINER // MIB} MB")
+            yield from self._parse_container(data)
+        self.stop()
 
     def _parse_data(self, data: bytes) -> Iterator[can.Message]:
         place = data.find(b"LOBJ", 0, 8)
