@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -374,10 +373,13 @@ class Model(Fields):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = as_path(path)
-        if not os.path.lexists(path):
+        try:
+            data = read_bounded(path, 4 * MIB, "a model file")
+        except InputError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
             cure = "`cangauge fit LOG -o MODEL.json` makes one"
-            raise InputError("no such file", source=path, cure=cure)
-        data = read_bounded(path, 4 * MIB, "a model file")
+            raise InputError(error.problem, source=path, cure=cure) from error
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
             json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text

@@ -33,6 +33,7 @@ VALID = {
     "estimate": ["absent.csv", "-m", "model.json", "-o", "out.csv"],
     "gap": ["absent.csv", "-m", "model.json"],
     "run": ["-m", "absent.json"],
+    "live": ["absent.toml"],
     "replay": ["absent.csv"],
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
