@@ -54,7 +54,7 @@ def test_where_a_current_wraps(bits: int, step_a: float, lowest_a: float, highes
         current, voltage = drive(bits, lowest_a, highest_a)
         found = wrapped_current(wrapped(sign * current, bits, step_a), voltage)
         assert found is not None
-        assert found.wraps_at_a == pytest.approx(2**bits * step_a)
+        assert found[0] == pytest.approx(2**bits * step_a)
 
 
 @pytest.mark.parametrize("seed", range(20))

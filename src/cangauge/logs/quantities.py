@@ -75,13 +75,21 @@ def _quantity(table: dict[str, Any]) -> LogQuantity:
     )
 
 
-_TABLE: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_TABLE: Final[dict[str, Any]] = tomllib.loads(
+    Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
+)
 QUANTITIES: Final[dict[str, LogQuantity]] = {
     name: _quantity(table) for name, table in _TABLE["quantity"].items()
 }
 """Quantities by the name that users write."""
 WORDS: Final = {name: _words(text) for name, text in _TABLE["words"].items()}
 """What the other words of a heading say."""
+LIMITS: Final = _TABLE["limits"]
+"""Plausible values, by name with unit."""
+EPOCHS: Final = _TABLE["epochs"]
+"""Seconds of a tick, and seconds from its origin to 1970, by name."""
+CURRENT_FIELDS: Final = _TABLE["fields"]
+"""Widths [bit] and steps [A] of a current's field on a bus, the usual ones first."""
 FIELDS: Final = {name: quantity.field for name, quantity in QUANTITIES.items()}
 """Canonical column by the name that users write."""
 REQUIRED: Final = tuple(FIELDS.values())[:4]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from typing import Final
 
@@ -10,6 +9,7 @@ import numpy as np
 from scipy import special
 
 from cangauge._typing import FloatArray
+from cangauge.logs.quantities import CURRENT_FIELDS
 
 _FREQUENT: Final = (3, 6, 12, 50)
 """Numbers of most frequent values whose differences are candidates for the quantum."""
@@ -23,32 +23,17 @@ _OFF_GRID: Final = 0.05
 """Largest distance from a place of the grid, in quanta."""
 _HUGS: Final = 0.05
 """Largest distance of the reading nearest to zero from it, relative to the range [-]."""
-_FIELDS: Final = tuple(
-    product((16, 15, 32, 14, 13, 12, 11, 10), (0.1, 0.01, 0.001, 1.0, 0.05, 0.5, 0.02, 0.025, 0.25))
-)
-"""Width [bit] and step [A] of a current's field on a bus, the usual ones first."""
 _BY_CHANCE: Final = 1e-4
 """Probability below which the voltage does not follow the steps of a current by chance [-]: tables
 are many, and few of them wrap."""
-_USUAL_BITS: Final = (16, 15, 32)
-"""Widths by which readings that never come near zero are those of a field [bit]."""
 
 
-@dataclass(frozen=True, slots=True)
-class WrappedCurrent:
-    """A signed current that was read as unsigned: below zero it continues from `wraps_at_a`.
+def wrapped_current(
+    current_a: FloatArray, voltage_v: FloatArray
+) -> tuple[float, int, float] | None:
+    """Return where a current wraps [A], width [bit] and step [A] of its field; None if nowhere.
 
-    `wraps_at_a` is `2**bits * step_a` [A], `reading_a` the largest reading [A].
-    """
-
-    wraps_at_a: float
-    bits: int
-    step_a: float
-    reading_a: float
-
-
-def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurrent | None:
-    """Return where a current wraps, or None if it does not.
+    A signed current that was read as unsigned continues below zero from `2**width * step`.
 
     The readings have one sign. Less `wraps_at_a` where they exceed its half, some come near zero,
     and the voltage follows their steps better than those of the readings: it does not move where
@@ -60,8 +45,7 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
     current_a, voltage_v : array of shape (n,)
         Readings [A], of either sign, and voltage [V].
     """
-    is_negative = bool(np.all(current_a <= 0.0))
-    if not is_negative and np.any(current_a < 0.0):
+    if np.any(current_a > 0.0) and np.any(current_a < 0.0):
         return None
     readings = np.abs(current_a)
     largest = float(readings.max())
@@ -73,7 +57,7 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
     range_a = float(np.ptp(np.where(is_high, readings - largest, readings)))
     fields = [
         (2.0**bits * step_a, step_a, bits)
-        for bits, step_a in _FIELDS
+        for bits, step_a in product(CURRENT_FIELDS["bits"], CURRENT_FIELDS["steps_a"])
         if 0.0 <= 2.0**bits * step_a * (1.0 + 1e-9) - largest <= _HUGS * range_a
     ]
     if not fields:
@@ -92,9 +76,8 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
         by_chance = float(special.betainc(0.5 * max(steps.size - 1, 1), 0.5, 1.0 - share))
         is_wrapped = by_chance < _BY_CHANCE and share > _explained(steps, moved_v)
     else:
-        is_wrapped = shows_step and bits in _USUAL_BITS
-    reading_a = -largest if is_negative else largest
-    return WrappedCurrent(wraps_at_a, bits, step_a, reading_a) if is_wrapped else None
+        is_wrapped = shows_step and bits in CURRENT_FIELDS["bits"][:3]  # never near zero: the usual
+    return (wraps_at_a, bits, step_a) if is_wrapped else None
 
 
 def _is_multiple(values: FloatArray, step: float) -> bool:

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.quantities import unit_of
+from cangauge.logs.quantities import EPOCHS, LIMITS, unit_of
 from cangauge.logs.values import first_text, is_number, is_text, numbers_of, present, unit_in_cell
 
 _CLOCK: Final = (
@@ -59,18 +59,6 @@ _MONTHS: Final = {
     for name in names.split("/")
 }
 _ORDERS: Final = ("ymd", "dmy", "mdy")
-_PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_EPOCHS: Final = (
-    (1.0, 0.0, "s since 1970"),
-    (1e-9, 0.0, "ns since 1970"),
-    (1e-6, 0.0, "µs since 1970"),
-    (1e-3, 0.0, "ms since 1970"),
-    (1e-7, 11_644_473_600.0, "100 ns since 1601"),
-    (1e-7, 62_135_596_800.0, "100 ns since the year 1"),
-)
-"""Seconds of a tick, seconds from its origin to 1970, and its name."""
-_CAN_LOGS_S: Final = (662_688_000.0, 4_102_444_800.0)
-"""1991, the first car with CAN, and 2100 [s since 1970]; no two of the epochs overlap in them."""
 _LEAST_EPOCH: Final = 1e11
 """Least number that is ticks since a date: milliseconds, of 1973."""
 _DIGITS: Final = r"^(19|20)?\d{2}(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}$"
@@ -132,7 +120,8 @@ def seconds_of(
     column, kind = parts[0], parts[0].type
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
         counts = column.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
-        seconds = np.asarray(counts, dtype=np.float64) / _PER_SECOND[kind.unit]
+        tick_s, _ = unit_of("time_s", kind.unit) or (1.0, 0.0)
+        seconds = np.asarray(counts, dtype=np.float64) / round(1.0 / tick_s)
         return seconds, str(kind) if is_format or not unit else unit
     if len(parts) > 1:
         joined = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
@@ -179,8 +168,8 @@ def _seconds_of_numbers(
     values = np.where(np.isfinite(values), values, np.nan)
     finite = values[np.isfinite(values)]
     typical = float(np.median(finite)) if finite.size else 0.0
-    first_s, last_s = _CAN_LOGS_S
-    for tick_s, origin_s, name in _EPOCHS:
+    first_s, last_s = LIMITS["can_logs_s"]
+    for name, (tick_s, origin_s) in EPOCHS.items():
         if first_s <= typical * tick_s - origin_s <= last_s:
             ticks = values - origin_s / tick_s  # before scaling: 100 ns of 2000 years need 63 bits
             return ticks * tick_s, f"{name}, from its size"

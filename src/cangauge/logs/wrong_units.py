@@ -10,7 +10,7 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
-from cangauge.logs.quantities import QUANTITIES
+from cangauge.logs.quantities import LIMITS, QUANTITIES
 from cangauge.logs.resolution import wrapped_current
 
 _TIME_UNITS: Final = QUANTITIES["time"].units
@@ -23,27 +23,6 @@ _WORDS: Final = {
     "h": "hours",
     "d": "days (dates of a spreadsheet)",
 }
-
-# Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
-_MAX_VOLTAGE_V: Final = 1500.0
-_MAX_CURRENT_A: Final = 2000.0
-_MAX_INTERVAL_S: Final = 90.0
-"""Usual time between rows of a log that counts charge [s]: cyclers log every 60 s at rest."""
-_MAX_RATE_HZ: Final = 2000.0
-_FASTEST_S: Final = 0.01
-"""Shortest cycle of a battery's message on a bus [s]: what fits a time without a unit."""
-_FASTEST_C: Final = 60.0
-"""Highest RMS current by capacity [1/h]: no battery is emptied in a minute."""
-_MAX_DAYS: Final = 366.0
-"""First to last row [d]: setting the clock within a log can add decades."""
-_MAX_STAMP_S: Final = 5e11
-"""Largest time of a row [s]: a Julian date has 2e11; in ms since 1970, 1985."""
-_UNUSUALLY_HOT_C: Final = 62.0
-_EXCEL_1990: Final = 32_874.0
-"""1990-01-01 as a spreadsheet's date [d since 1899-12-30]; as hours, nearly four years."""
-_RARE: Final = 1e-3
-"""Fraction of impossible currents up to which they are codes, not another unit [-]."""
-
 WRAPPED: Final = "a signed value was read as unsigned"
 """What is wrong with a current of one sign that wraps."""
 
@@ -78,8 +57,9 @@ def refuse_wrong_units(
     current, voltage = values["current_a"], values["voltage_v"]
     temperature = values["temperature_c"]
     voltage_label = labels.get("voltage_v", "voltage_v")
-    is_low = bool(COLDEST_C <= np.median(voltage) <= _UNUSUALLY_HOT_C)  # as a temperature
+    is_low = bool(COLDEST_C <= np.median(voltage) <= LIMITS["unusually_hot_c"])  # as a temperature
     checks = (
+        ("current_a", _wrapped(current, voltage)),
         ("time_s", _wrong_time(values, in_seconds=in_seconds)),
         # Before the voltage: a temperature in its place looks like kilovolts.
         ("temperature_c", _swapped(temperature, voltage_label) if is_low else ()),
@@ -88,7 +68,6 @@ def refuse_wrong_units(
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
         ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
     )
-    _refuse_wrapped(current, voltage, source, labels.get("current_a", "current_a"))
     for field, found in checks:
         label = labels.get(field, field)
         for value, problem, cure, units in found:  # the first is raised
@@ -100,7 +79,7 @@ def refuse_wrong_units(
     doubt = "" if "temperature_c" in stated else f": if it is °F, state the unit: {option}"
     typical = float(np.median(temperature))
     remark = f"temperature {typical:.0f} °C is unusually hot{doubt}"
-    return (remark,) if typical > _UNUSUALLY_HOT_C else ()
+    return (remark,) if typical > LIMITS["unusually_hot_c"] else ()
 
 
 def _option(field: str, label: str, units: list[str]) -> str:
@@ -130,29 +109,29 @@ def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Wrong:
 
 def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> Iterator[_Wrong]:
     time = values["time_s"]
-    if time[0] > _MAX_STAMP_S:
+    if time[0] > LIMITS["stamp_s"]:
         yield time[0], "time looks like milliseconds since 1970", "divide it by 1000", ["ms"]
-    yield from _odd_row(time, np.abs(time) > _MAX_STAMP_S, "a time in seconds")
+    yield from _odd_row(time, np.abs(time) > LIMITS["stamp_s"], "a time in seconds")
     step = np.diff(time) if time.size > 1 else np.ones(1)
     interval, days = float(np.median(step)), step.sum() / 86400.0
     apart = f"rows are {interval:g} apart"
     finer = _fitting(interval, ("ms", "us", "ns"))
-    coarser = ["d"] if time[0] > _EXCEL_1990 else _fitting(interval, ("min", "h", "d"))
+    coarser = ["d"] if time[0] > LIMITS["spreadsheet_d"] else _fitting(interval, ("min", "h", "d"))
     words = [" or ".join(_WORDS[each] for each in units) for units in (finer, coarser)]
-    if interval > _MAX_INTERVAL_S:
+    if interval > LIMITS["interval_s"]:
         too_slow = "a log with a row every 90 s or more cannot be used"
         if in_seconds:
             problem = f"rows are {interval:g} s apart: {too_slow}"
             yield interval, problem, "export a row each minute", []
         problem = f"{apart}: time looks like {words[0] or 'another unit'}"
         yield interval, problem, f"convert it to seconds ({too_slow})", finer
-    if not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ:
+    if not in_seconds and 0.0 < interval < 1.0 / LIMITS["rate_hz"]:
         problem = f"{apart}: time looks like {words[1] or 'another unit'}"
         yield interval, problem, "convert it to seconds", coarser
     if in_seconds is None and (others := _other_units(values, finer, coarser)):
         problem = f"{apart}, in seconds or another unit"
         yield interval, problem, "name the unit in the heading", ["s", *others]
-    if days > _MAX_DAYS:
+    if days > LIMITS["log_d"]:
         row = int(np.argmax(step)) + 1
         problem = f"the log lasts {days:.0f} days; its longest step ends at row {row + 1}"
         yield time[row], problem, "if the clock was set there, split the log there", []
@@ -161,7 +140,7 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
 def _fitting(interval: float, units: Sequence[str]) -> list[str]:
     """Return those of the units in which rows are as far apart as a log's."""
     step_s = {unit: interval * _TIME_UNITS[unit][0] for unit in units}
-    return [unit for unit in units if _FASTEST_S <= step_s[unit] <= _MAX_INTERVAL_S]
+    return [unit for unit in units if LIMITS["fastest_s"] <= step_s[unit] <= LIMITS["interval_s"]]
 
 
 def _other_units(values: dict[str, FloatArray], finer: list[str], coarser: list[str]) -> list[str]:
@@ -171,7 +150,7 @@ def _other_units(values: dict[str, FloatArray], finer: list[str], coarser: list[
     # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
     if finer and np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0:
         # A SoC settles it: the charge in a finer unit would be too little for it.
-        return [] if _c_rate(values) / scale[finer[0]][0] > _FASTEST_C else finer
+        return [] if _c_rate(values) / scale[finer[0]][0] > LIMITS["c_rate_per_h"] else finer
     mean = float(step.mean())
     parts = [1000.0 * mean, *(mean * scale[unit][0] for unit in coarser)]
     are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
@@ -198,35 +177,34 @@ def _c_rate(values: dict[str, FloatArray]) -> float:
 
 def _wrong_voltage(voltage: FloatArray) -> Iterator[_Wrong]:
     typical = float(np.median(voltage))
-    if typical > _MAX_VOLTAGE_V:
-        yield _in_finer_unit(typical, _MAX_VOLTAGE_V, "volts", "voltage")
+    if typical > LIMITS["voltage_v"]:
+        yield _in_finer_unit(typical, LIMITS["voltage_v"], "volts", "voltage")
     if typical <= 0.0:
         yield typical, "the median voltage is not positive", "check column and polarity", []
     if typical < 1.0:
         yield typical, "voltage looks like kilovolts", "convert it to volts", ["kV"]
-    yield from _odd_row(voltage, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage")
+    yield from _odd_row(voltage, np.abs(voltage) > LIMITS["voltage_v"], "a battery's voltage")
 
 
-def _refuse_wrapped(current: FloatArray, voltage: FloatArray, source: object, label: str) -> None:
-    """Raise InputError if a signed current was read as unsigned; shape (n,) in A and V."""
+def _wrapped(current: FloatArray, voltage: FloatArray) -> Iterator[_Wrong]:
     found = wrapped_current(current, voltage)
     if found is not None:
-        field = f"{found.bits} bits unsigned of {found.step_a:g} A"
-        problem = f"the current wraps at {found.wraps_at_a:.10g} A ({field}): {WRAPPED}"
-        cure = f"read it as signed: {found.wraps_at_a:.10g} A less, from half of that on"
-        value = found.reading_a
-        raise InputError(problem, source=str(source), field=label, value=value, cure=cure)
+        wraps_at_a, bits, step_a = found
+        field = f"{bits} bits unsigned of {step_a:g} A"
+        problem = f"the current wraps at {wraps_at_a:.10g} A ({field}): {WRAPPED}"
+        cure = f"read it as signed: {wraps_at_a:.10g} A less, from half of that on"
+        yield current[np.argmax(np.abs(current))], problem, cure, []
 
 
 def _wrong_current(current: FloatArray) -> Iterator[_Wrong]:
     size = np.abs(current)
-    large, peak = size > _MAX_CURRENT_A, int(np.argmax(size))
+    large, peak = size > LIMITS["current_a"], int(np.argmax(size))
     digits = [int(f"{amps:f}".replace(".", "").strip("0")) for amps in set(size[large])]
-    if (np.mean(large) < _RARE and current.size > 1000) or all(map(_is_code, digits)):
+    if (np.mean(large) < LIMITS["odd_share"] and current.size > 1000) or all(map(_is_code, digits)):
         yield from _odd_row(current, large, "a battery's current")
     if large.any():
-        what = f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it"
-        yield _in_finer_unit(float(current[peak]), _MAX_CURRENT_A, "amperes", what)
+        what = f"current exceeds {LIMITS['current_a']:g} A in row {peak + 1}: it"
+        yield _in_finer_unit(float(current[peak]), LIMITS["current_a"], "amperes", what)
 
 
 def _is_code(number: int) -> bool:
@@ -250,7 +228,7 @@ def _wrong_soc(soc: FloatArray | None, *, is_stated: bool) -> Iterator[_Wrong]:
 
 def _swapped(temperature: FloatArray, label: str) -> Iterator[_Wrong]:
     typical = float(np.median(temperature))
-    is_high = 273.15 + _UNUSUALLY_HOT_C < typical <= _MAX_VOLTAGE_V
+    is_high = 273.15 + LIMITS["unusually_hot_c"] < typical <= LIMITS["voltage_v"]
     if is_high and np.ptp(temperature) > 0.0:  # a constant is a code
         problem = f"it looks like a pack's voltage, and {label} like a temperature"
         yield typical, problem, "the two columns (or signals) look swapped: exchange them", []
