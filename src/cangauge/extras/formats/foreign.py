@@ -44,6 +44,11 @@ _FORMATS: Final = (
         "convert it with NewareNDA: NewareNDA.read(file).to_csv('log.csv')",
     ),
     (
+        rb"EXPLAIN\r?\n",
+        "a Gamry .dta",
+        "name its columns: --columns 'time=T[s],voltage=Vf[V],current=Im[A]'",
+    ),
+    (
         rb"(?s).{4}Standard Jet DB",
         "an Access database, as Arbin's .res",
         "export it as CSV in MITS Pro, or by mdb-export of mdbtools",
