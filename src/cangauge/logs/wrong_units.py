@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -68,28 +69,43 @@ def refuse_wrong_units(
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
         ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
     )
+    wrong: dict[str, _Wrong] = {}
     for field, found in checks:
-        label = labels.get(field, field)
-        for value, problem, cure, units in found:  # the first is raised
-            if units and label.lower() != field and field not in stated:
-                cure = f"{cure} (or state the unit: {_option(field, label, units)})"  # noqa: PLW2901
-            where = str(source)
-            raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
-    option = _option("temperature_c", labels.get("temperature_c", "temperature_c"), ["°F"])
+        for first in islice(found, 1):
+            wrong.setdefault(field, first)
+    named = {
+        field: (labels[field], units)
+        for field, (*_, units) in wrong.items()
+        if units and field not in stated and labels.get(field, field).lower() != field
+    }
+    for field, (value, problem, cure, _) in wrong.items():  # the first is raised
+        if field in named:
+            sure = {each: column for each, column in named.items() if len(column[1]) == 1}
+            options = sure if field in sure else {field: named[field]}
+            cure = f"{cure} (or state the unit: {_option(options)})"  # noqa: PLW2901
+            if len(options) > 1:
+                cure = f"state the units: {_option(options)}"  # noqa: PLW2901
+        label, where = labels.get(field, field), str(source)
+        raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
+    option = _option({"temperature_c": (labels.get("temperature_c", "temperature_c"), ["°F"])})
     doubt = "" if "temperature_c" in stated else f": if it is °F, state the unit: {option}"
     typical = float(np.median(temperature))
     remark = f"temperature {typical:.0f} °C is unusually hot{doubt}"
     return (remark,) if typical > LIMITS["unusually_hot_c"] else ()
 
 
-def _option(field: str, label: str, units: list[str]) -> str:
-    """Return the option that states the unit of a column, "?" where several are possible."""
-    column = f"{field.rpartition('_')[0]}={label}"
+def _option(columns: dict[str, tuple[str, list[str]]]) -> str:
+    """Return the option that states the units of columns, "?" where several are possible."""
+    field, (label, units) = next(iter(columns.items()))
     is_tick = field == "time_s" and "tick" in label.lower()
     if len(units) == 1 and not is_tick:
-        return f"--columns '{column}[{units[0]}]'"
+        parts = (
+            f"{name.rpartition('_')[0]}={of}[{unit}]" for name, (of, [unit]) in columns.items()
+        )
+        return f"--columns '{','.join(parts)}'"
     factor = " and a factor, such as [ms]:10 for ticks of 10 ms" if is_tick else ""
-    return f"--columns '{column}[?]', with {' or '.join(units)} for ?{factor}"
+    option = f"--columns '{field.rpartition('_')[0]}={label}[?]'"
+    return f"{option}, with {' or '.join(units)} for ?{factor}"
 
 
 def _odd_row(values: FloatArray, wrong: BoolArray, kind: str) -> Iterator[_Wrong]:
