@@ -118,14 +118,14 @@ def test_every_frame_is_read_at_its_time(tmp_path: Path, name: str) -> None:
     path = write(tmp_path, line, stamps_s.tolist())
     frames, capture = read(path)
     times_s = np.array([each.timestamp for each in frames])
-    assert (capture.info.frames, capture.info.malformed) == (len(TIMES_S), 0)
+    assert (capture.info["frames"], capture.info["malformed"]) == (len(TIMES_S), 0)
     assert np.diff(times_s) == pytest.approx(STEP_S, abs=2e-3)
     assert frames[0].timestamp == pytest.approx(stamps_s[0], abs=1e-3)
     found = succeeds("inspect", path, "--map", tmp_path / "map.toml", "--json").json
     assert found["log"]["rows"] == len(TIMES_S)
     assert found["log"]["charge"]["net_ah"] == pytest.approx(NET_AH, abs=1e-3)
     turns = round(times_s[-1] - times_s[0] - (stamps_s[-1] - stamps_s[0]))
-    is_said = any("the clock starts again every" in each for each in capture.info.remarks)
+    is_said = any("the clock starts again every" in each for each in capture.info["remarks"])
     assert is_said == (turns > 0 or line in {carbus, slcan, usb_can})
 
 
@@ -146,7 +146,7 @@ def test_stale_rows_at_the_head_are_left_out_and_said(tmp_path: Path, before_s: 
     stamps_s[:4] += before_s
     frames, capture = read(write(tmp_path, gvret, stamps_s.tolist()))
     assert [each.timestamp for each in frames] == pytest.approx(TIMES_S[4:])
-    assert "4 frames at the head left out, with stamps of another time" in capture.info.remarks
+    assert "4 frames at the head left out, with stamps of another time" in capture.info["remarks"]
 
 
 def test_two_adapters_with_two_clocks_are_two_times(tmp_path: Path) -> None:
@@ -157,14 +157,14 @@ def test_two_adapters_with_two_clocks_are_two_times(tmp_path: Path) -> None:
     frames, capture = read(tmp_path / "x.log")
     assert [each.timestamp for each in frames[::2]] == pytest.approx(TIMES_S[::2])
     assert [each.timestamp for each in frames[1::2]] == pytest.approx(TIMES_S[1::2] + 5000.0)
-    assert capture.info.remarks == ()
+    assert capture.info["remarks"] == ()
 
 
 def test_a_late_frame_at_the_turn_of_a_minute_stays_before_it(tmp_path: Path) -> None:
     stamps_s = [59.8, 59.9, 60.02, 59.99, *(60.1 + TIMES_S[:50])]
     frames, capture = read(write(tmp_path, carbus, stamps_s))
     assert [each.timestamp for each in frames] == pytest.approx(stamps_s)
-    assert capture.info.remarks == ("the clock starts again every 60 s (1 times): time goes on",)
+    assert capture.info["remarks"] == ("the clock starts again every 60 s (1 times): time goes on",)
 
 
 def test_time_that_runs_backwards_is_refused(tmp_path: Path) -> None:
@@ -182,8 +182,8 @@ def test_lines_that_are_no_frames_are_counted(tmp_path: Path, line: Line) -> Non
     lines[-10] = "!!! buffer overrun"
     path.write_text("\n".join([*lines, ""]))
     frames, capture = read(path)
-    assert (len(frames), capture.info.malformed) == (48, 2)
-    assert "2 malformed lines skipped" in " ".join(capture.info.remarks)
+    assert (len(frames), capture.info["malformed"]) == (48, 2)
+    assert "2 malformed lines skipped" in " ".join(capture.info["remarks"])
 
 
 TRC = (
@@ -200,7 +200,7 @@ def test_lines_that_python_can_leaves_out_are_said(tmp_path: Path) -> None:
     (tmp_path / "x.trc").write_text(TRC)
     frames, capture = read(tmp_path / "x.trc")
     assert len(frames) == 3
-    assert "2 lines left out, which python-can does not read" in capture.info.remarks
+    assert "2 lines left out, which python-can does not read" in capture.info["remarks"]
 
 
 CSV = (
@@ -214,6 +214,6 @@ def test_a_malformed_line_does_not_end_what_python_can_reads(tmp_path: Path, tex
     (tmp_path / "x.csv").write_text(text)
     frames, capture = read(tmp_path / "x.csv")
     assert len(frames) == 3
-    assert not capture.info.cut_off
-    said = [int(remark.split()[0]) for remark in capture.info.remarks]
+    assert not capture.info["cut_off"]
+    said = [int(remark.split()[0]) for remark in capture.info["remarks"]]
     assert sum(said) == 2

@@ -116,7 +116,7 @@ class Conformance:
             )
 
     def test_recognised_by_content_alone(self, path: Path) -> None:
-        assert open_capture(path).info.format == self.reader.name
+        assert open_capture(path).info["format"] == self.reader.name
 
     def test_packed_and_from_a_file_object(self, path: Path, tmp_path: Path) -> None:
         plain = self.facts(self.reader(path))
@@ -544,7 +544,7 @@ def test_other_packages_add_readers(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         path.write_text("MINE\n1.5 291 aabb\n2.5 292 cc\n")
         capture = open_capture(path)
         assert [(f.timestamp, f.arbitration_id) for f in capture] == [(1.5, 291), (2.5, 292)]
-        assert capture.info.format == "my format"
+        assert capture.info["format"] == "my format"
     finally:
         capture_readers.cache_clear()
 

@@ -116,7 +116,7 @@ def test_every_text_format_is_recognised_and_read(tmp_path: Path, name: str, pac
     capture = open_capture(path)
     messages = list(capture)
     info = capture.info
-    assert (info.format, info.frames, info.malformed) == (name, frames, 0)
+    assert (info["format"], info["frames"], info["malformed"]) == (name, frames, 0)
     assert len(messages) == frames
     assert messages[-1].is_extended_id or name in {"tab-separated table", "candump log"}
     assert [facts(each) for each in capture] == [facts(each) for each in messages]  # again
@@ -135,8 +135,8 @@ def test_tables_have_stamps_in_whole_milliseconds(tmp_path: Path) -> None:
     assert facts(first) == (1052620.673, 0x1DA, False, "c832180000010159")
     assert facts(second) == (1052620.674, 0x18FF0001, True, "1064")
     assert (first.is_rx, second.is_rx) == (True, False)
-    assert capture.info.stamps == "ms"
-    assert capture.info.remarks == ("time stamps are whole milliseconds",)
+    assert capture.info["stamps"] == "ms"
+    assert capture.info["remarks"] == ("time stamps are whole milliseconds",)
     other = list(open_capture(write(tmp_path, TABLE_WITHOUT_PARSER)))
     assert [facts(each) for each in other] == [
         (565214.935, 0x603, False, "00"),
@@ -185,8 +185,8 @@ def test_gvret_filtered_to_an_id(
     capture = open_capture(write(tmp_path, text))
     times = [each.timestamp for each in capture]
     assert times[-1] - times[0] == pytest.approx(199 / per_s / (1 if read == "ms" else 1000))
-    assert capture.info.stamps == read
-    assert remark in capture.info.remarks[-1]
+    assert capture.info["stamps"] == read
+    assert remark in capture.info["remarks"][-1]
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_gvret_in_microseconds_leaves_time_for_the_bits(
         text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
         capture = open_capture(write(tmp_path, text))
         list(capture)
-        assert capture.info.stamps == read
+        assert capture.info["stamps"] == read
 
 
 def test_traces_of_can_hacker_and_carbus(tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_relative_stamps_of_asc_that_rise_count_from_the_start(tmp_path: Path) -
     )  # every fifth frame is written after the one that follows it
     capture = open_capture(write(tmp_path, text))
     assert [each.timestamp for each in capture][-1] == 2.99
-    assert capture.info.remarks == ("relative time stamps rise: taken as time since the start",)
+    assert capture.info["remarks"] == ("relative time stamps rise: taken as time since the start",)
 
 
 PEAK = {
@@ -310,8 +310,8 @@ def test_without_stamps_frames_of_the_clock_count_time(tmp_path: Path) -> None:
     path = write(tmp_path, SCREEN)
     capture = open_capture(path)
     assert [each.timestamp for each in capture] == [0.0, 0.0, 0.01, 0.01]
-    assert capture.info.stamps == "none"
-    assert "0x1DB, one every 10 ms" in capture.info.remarks[0]
+    assert capture.info["stamps"] == "none"
+    assert "0x1DB, one every 10 ms" in capture.info["remarks"][0]
     slower = open_capture(path, clock=(0x1ED, 0.5))
     assert [each.timestamp for each in slower] == [0.0, 0.0, 0.0, 0.0]
     with pytest.raises(InputError, match="no frames of 0x123"):
@@ -349,8 +349,8 @@ def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None
         assert readable <= frames <= readable + 1  # the last line may lack its end alone
     capture = open_capture(write(tmp_path, packed[:-20]))
     frames = sum(1 for _ in capture)
-    assert capture.info.cut_off
-    assert f"cut off after {frames} frames" in capture.info.remarks[-1]
+    assert capture.info["cut_off"]
+    assert f"cut off after {frames} frames" in capture.info["remarks"][-1]
 
 
 def test_a_capture_of_a_thousand_buses_is_one_of_the_first(tmp_path: Path) -> None:
@@ -360,7 +360,7 @@ def test_a_capture_of_a_thousand_buses_is_one_of_the_first(tmp_path: Path) -> No
     path.write_text("".join(f"({n}.000000) {name} 123#00\n" for n, name in enumerate(names)))
     capture = open_capture(path)
     assert {message.channel for message in capture} == {"can0", *(f"x{n}" for n in range(63))}
-    assert capture.info.malformed == 900 - 63
+    assert capture.info["malformed"] == 900 - 63
 
 
 def test_a_few_malformed_lines_are_skipped_and_counted(tmp_path: Path) -> None:
@@ -371,14 +371,14 @@ def test_a_few_malformed_lines_are_skipped_and_counted(tmp_path: Path) -> None:
     lines[12] = "0000.000000 FFFFFFFF 1 00\r\n"  # no such id
     capture = open_capture(write(tmp_path, "".join(lines)))
     assert sum(1 for _ in capture) == 16
-    assert (capture.info.malformed, capture.info.first_malformed) == (4, 4)
-    assert capture.info.remarks == ("4 malformed lines skipped (first: 4)",)
+    assert (capture.info["malformed"], capture.info["first_malformed"]) == (4, 4)
+    assert capture.info["remarks"] == ("4 malformed lines skipped (first: 4)",)
 
 
 def test_a_banner_before_the_frames_is_skipped(tmp_path: Path) -> None:
     capture = open_capture(write(tmp_path, "welcome to my logger\n" * 50 + SPACED * 100))
     assert sum(1 for _ in capture) == 400
-    assert capture.info.malformed == 50
+    assert capture.info["malformed"] == 50
 
 
 def test_mostly_junk_is_refused_by_line(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 from markupsafe import escape
 
 from cangauge._version import __version__
-from cangauge.bus.captures import CaptureInfo
 from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.recording import CaptureSamples, read_log
 from cangauge.estimation.offline import estimate_log
@@ -210,7 +209,6 @@ def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log
                 "parked.log",
                 "pack",
                 FrameStatistics(),
-                CaptureInfo("candump", "us"),
                 (),
             ),
             table=replace(estimate.table, **dict.fromkeys(numbers, nothing)),

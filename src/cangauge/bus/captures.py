@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 import can
 
 from cangauge._files import HEAD_BYTES, open_unpacked, read_beginning
-from cangauge.bus.readers import CaptureReader, Stamps, capture_readers
+from cangauge.bus.readers import CaptureReader, capture_readers
 from cangauge.errors import InputError
 
 CLOCK: Final = (0x1DB, 0.010)
@@ -32,14 +31,6 @@ _CURE: Final = f"known are: {KNOWN_CAPTURES}"
 # both.
 
 
-class Part(NamedTuple):
-    """One file of a recording."""
-
-    run: int
-    part: int
-    path: Path
-
-
 def part_path(path: Path, run: int, part: int) -> Path:
     """Return the name of a part of the recording `path`."""
     stem, suffix = _split(path)
@@ -52,8 +43,8 @@ def run_path(path: Path, run: int) -> Path:
     return path.with_name(f"{stem}-{run:04d}{suffix}")
 
 
-def all_parts(path: Path) -> list[Part]:
-    """Return the parts of all runs of the recording `path`, in order."""
+def all_parts(path: Path) -> list[tuple[int, int, Path]]:
+    """Return run, part and file of all parts of the recording `path`, in order."""
     stem, suffix = _split(path)
     pattern = re.compile(rf"{re.escape(stem)}-(\d{{4,9}})-(\d{{6,9}}){re.escape(suffix)}")
     try:
@@ -61,7 +52,7 @@ def all_parts(path: Path) -> list[Part]:
     except (OSError, ValueError):  # ValueError: a null byte in the path
         return []
     matches = ((pattern.fullmatch(file.name), file) for file in files)
-    return sorted(Part(int(match[1]), int(match[2]), file) for match, file in matches if match)
+    return sorted((int(match[1]), int(match[2]), file) for match, file in matches if match)
 
 
 def parts_of_run(path: Path) -> list[Path]:
@@ -74,7 +65,7 @@ def parts_of_run(path: Path) -> list[Path]:
     except OSError:  # a name that is too long
         return []
     parts = all_parts(path.with_name(match[1] + suffix))
-    return [each.path for each in parts if each.run == int(match[2])]
+    return [part for run, _, part in parts if run == int(match[2])]
 
 
 def _split(path: Path) -> tuple[str, str]:
@@ -86,19 +77,6 @@ def _split(path: Path) -> tuple[str, str]:
 
 
 # --- Captures
-
-
-@dataclass(frozen=True, slots=True)
-class CaptureInfo:
-    """Findings of reading a capture; fields as of `CaptureReader`, `format` is its name."""
-
-    format: str
-    stamps: Stamps
-    frames: int = 0
-    malformed: int = 0
-    first_malformed: int | None = None
-    cut_off: bool = False
-    remarks: tuple[str, ...] = ()
 
 
 class Capture:
@@ -124,25 +102,32 @@ class Capture:
         self._readers: list[CaptureReader] = []
 
     @property
-    def info(self) -> CaptureInfo:
-        """Findings of the latest iteration; complete after its end."""
+    def info(self) -> dict[str, Any]:
+        """Findings of the latest iteration, complete after its end: attributes of `CaptureReader`.
+
+        `format` is its name.
+        """
         readers = self._readers
         firsts = (each.first_malformed for each in readers)
-        return CaptureInfo(
-            format=self._kind.name,
-            stamps=readers[0].stamps if readers else self._kind.stamps,
-            frames=sum(each.frames for each in readers),
-            malformed=sum(each.malformed for each in readers),
-            first_malformed=next((first for first in firsts if first is not None), None),
-            cut_off=any(each.cut_off for each in readers),
-            remarks=tuple(self._remarks(readers)),
-        )
+        return {
+            "format": self._kind.name,
+            "stamps": self._stamps,
+            "frames": sum(each.frames for each in readers),
+            "malformed": sum(each.malformed for each in readers),
+            "first_malformed": next((first for first in firsts if first is not None), None),
+            "cut_off": any(each.cut_off for each in readers),
+            "remarks": tuple(self._remarks()),
+        }
 
-    def _remarks(self, readers: Sequence[CaptureReader]) -> Iterator[str]:
-        stamps = readers[0].stamps if readers else self._kind.stamps
-        if stamps == "ms":
+    @property
+    def _stamps(self) -> str:
+        return self._readers[0].stamps if self._readers else self._kind.stamps
+
+    def _remarks(self) -> Iterator[str]:
+        readers = self._readers
+        if self._stamps == "ms":
             yield "time stamps are whole milliseconds"
-        elif stamps == "none":
+        elif self._stamps == "none":
             number, period_s = self._clock
             yield (
                 "no time stamps: time is counted from 0 by frames of"

@@ -88,12 +88,8 @@ class BitField:
         return cls(8 * length - from_top - signal.length, signal.length, big_endian=True)
 
 
-@dataclass(frozen=True, slots=True)
-class MultiplexCondition:
-    """Multiplexer values with which a signal is present in a frame."""
-
-    field: BitField
-    values: frozenset[int]
+Condition = tuple[BitField, frozenset[int]]
+"""A multiplexer, and its values with which a signal is present in a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +104,7 @@ class SignalCodec:
         Bits; `float_format` is the `struct` format of an IEEE float, "" for integers.
     not_available : frozenset of int
         Raw codes without a value, negative where those of a signed signal are.
-    conditions : tuple of MultiplexCondition
+    conditions : tuple of Condition
         All must hold for the signal to be present in a frame.
 
     Attributes
@@ -125,7 +121,7 @@ class SignalCodec:
     factor: float
     offset: float
     not_available: frozenset[int]
-    conditions: tuple[MultiplexCondition, ...] = ()
+    conditions: tuple[Condition, ...] = ()
     gain: float = 1.0
     shift: float = 0.0
     decode: Decode = dataclasses.field(init=False, repr=False, compare=False)
@@ -160,15 +156,15 @@ class SignalCodec:
 
     def is_in(self, payload: bytes | bytearray) -> bool:
         """Return whether the signal is present, according to its multiplexers, if any."""
-        return all(each.field.get(payload) in each.values for each in self.conditions)
+        return all(field.get(payload) in values for field, values in self.conditions)
 
     def encode_into(self, payload: bytearray, value: float) -> None:
         """Set the signal and its multiplexers; NaN becomes the first "not available" code.
 
         Raises InputError if the value does not fit, or is NaN and there is no such code.
         """
-        for condition in self.conditions:
-            condition.field.put(payload, min(condition.values))
+        for field, values in self.conditions:
+            field.put(payload, min(values))
         self.field.put(payload, self._raw(value))
 
     def _raw(self, value: float) -> int:
@@ -302,7 +298,7 @@ def signal_codec(
     bits = bits_of(signal)
     conditions = []
     for selector, values in _selectors(message, signal, source, field):
-        conditions.append(MultiplexCondition(bits_of(selector), values))
+        conditions.append((bits_of(selector), values))
     for name, value in (when or {}).items():
         other = _signal(message, name)
         if other is None:
@@ -310,7 +306,7 @@ def signal_codec(
             raise InputError(problem, source=str(source), field=f"{field}.when", value=name)
         other_bits = bits_of(other)
         raw = value & ((1 << other_bits.width) - 1)
-        conditions.append(MultiplexCondition(other_bits, frozenset({raw})))
+        conditions.append((other_bits, frozenset({raw})))
     conversion = signal.conversion
     is_signed = (signal.is_signed or signed) and not conversion.is_float
     return SignalCodec(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import can
 import numpy as np
@@ -36,8 +36,6 @@ _DUPLICATE, _NO_REASON, _GOOD = Reason.DUPLICATE_SENDER, Reason.NONE, Verdict.GO
 SUSPECTED_FOR_S: Final = 10.0
 """Time after the last sign of a second sender for which a message is refused [s]: longer than an
 attacker's pause between two tries, well below the longest gap over which charge is counted."""
-_LATEST: Final = 1000
-"""Currents by which a signed number that is read unsigned is found: 10 s of a fast message."""
 
 
 @dataclass(slots=True)
@@ -142,14 +140,6 @@ class CellVoltages:
                     self._voltage_v[at], self._time_s[at] = volts, time_s
 
 
-class _Input(NamedTuple):
-    """A signal of a message; `is_present` for multiplexed ones."""
-
-    decode: Callable[[bytes | bytearray], float]
-    is_present: Callable[[bytes | bytearray], bool] | None
-    health: SignalHealth
-
-
 @dataclass(slots=True)
 class _Route:
     """A wanted message: its checks, its signals, and place and codec of the cells in it."""
@@ -158,7 +148,7 @@ class _Route:
     length: int
     checker: FrameChecker | None
     statistics: MessageStatistics
-    inputs: list[_Input] = field(default_factory=list)
+    inputs: list[tuple[SignalCodec, SignalHealth]] = field(default_factory=list)
     cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
     last_s: float = -math.inf
     suspected_s: float = -math.inf  # the last sign of a second sender
@@ -216,8 +206,8 @@ class _Route:
 
     def _refuse(self, reason: Reason, *, is_repeated: bool = False) -> None:
         """Record a refused frame as a failure of each of its signals."""
-        for signal in self.inputs:
-            signal.health.fail(reason, is_repeated=is_repeated)
+        for _, health in self.inputs:
+            health.fail(reason, is_repeated=is_repeated)
 
 
 def unsigned_reading(codec: SignalCodec, current_a: FloatArray) -> tuple[str, str] | None:
@@ -297,7 +287,7 @@ class SampleDecoder:
             for place, cell in enumerate(vehicle.cells.cells):
                 self._route(cell).cells.append((place, cell.codec))
         self._current, self._voltage = self.health["current"], self.health["voltage"]
-        self._latest_a: deque[float] = deque(maxlen=_LATEST)
+        self._latest_a: deque[float] = deque(maxlen=1000)  # 10 s of a fast message
         self._temperature = self.health.get("temperature")
         health = self.health
         self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
@@ -317,8 +307,7 @@ class SampleDecoder:
         )
         if route.checker is not None and not is_multiplexed:
             route.checker.learned_period_s = health.learned_period_s
-        is_present = signal.codec.is_in if is_multiplexed else None
-        route.inputs.append(_Input(signal.codec.decode, is_present, health))
+        route.inputs.append((signal.codec, health))
 
     def _route(self, signal: VehicleSignal) -> _Route:
         key = signal.key
@@ -371,10 +360,10 @@ class SampleDecoder:
         if route.cells and self.cells is not None:
             self.cells.read(route.cells, payload, time_s)
         current_a = voltage_v = math.nan
-        for decode, is_present, health in route.inputs:
-            if is_present is not None and not is_present(payload):
+        for codec, health in route.inputs:
+            if codec.conditions and not codec.is_in(payload):
                 continue
-            decoded = decode(payload)
+            decoded = codec.decode(payload)
             value = health.update(decoded, time_s)
             if health is self._current:
                 current_a = value
@@ -436,11 +425,11 @@ class SampleDecoder:
     def wrong_periods(self) -> dict[str, str]:
         """Messages that come much more often than the map or the DBC states, and what to do."""
         return {
-            route.name: f"{route.name} comes each {each.health.period_s:.2g} s: its stated period"
+            route.name: f"{route.name} comes each {health.period_s:.2g} s: its stated period"
             " is much longer, and is not used; period_s in the map file is in seconds"
             for route in self._routes.values()
-            for each in route.inputs
-            if each.health.is_faster_than_stated
+            for _, health in route.inputs
+            if health.is_faster_than_stated
         }
 
     @property

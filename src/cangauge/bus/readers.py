@@ -25,7 +25,7 @@ from typing import IO, Any, ClassVar, Final, Literal, Self, cast
 
 import can
 from can.io.blf import BLFParseError
-from can.io.generic import BinaryIOMessageReader, MessageReader, TextIOMessageReader
+from can.io.generic import MessageReader, TextIOMessageReader
 from can.typechecking import StringPathLike
 
 from cangauge._files import open_unpacked
@@ -56,8 +56,6 @@ FIRST_DATE_S: Final = 1e9
 MOST_BUSES: Final = 64
 """Most buses in a file, each of which has its own decoder; frames of further ones are malformed."""
 MAX_ID: Final = 0x1FFFFFFF
-MAX_STANDARD_ID: Final = 0x7FF
-MAX_BYTES: Final = 64
 ERROR_FLAG: Final = 0x20000000
 
 Stamps = Literal["us", "ms", "none"]
@@ -272,10 +270,6 @@ class _Clock:
             )
 
 
-class BinaryReader(CaptureReader, BinaryIOMessageReader):
-    """Reader of a binary format."""
-
-
 class LineReader(CaptureReader, TextIOMessageReader):
     """Reader of a text format with one frame a line.
 
@@ -362,12 +356,12 @@ def frame(
     bytes.
     """
     arbitration_id = int(number, 16) if isinstance(number, str) else number
-    is_large = arbitration_id > MAX_STANDARD_ID
+    is_large = arbitration_id > 0x7FF
     if not 0 <= arbitration_id <= MAX_ID or (is_large and is_extended is False):
         raise ValueError("no such id")
     content = bytes.fromhex(data or "")
     size = len(content) if length is None else int(length or 0)
-    if len(content) > MAX_BYTES or (data is not None and size != len(content)):
+    if len(content) > 64 or (data is not None and size != len(content)):
         raise ValueError("length and bytes differ")
     more.setdefault("is_fd", len(content) > 8)
     return can.Message(

@@ -24,7 +24,6 @@ from cangauge.bus.captures import (
     CLOCK,
     KNOWN_CAPTURES,
     Capture,
-    CaptureInfo,
     find_capture,
     open_capture,
     parts_of_run,
@@ -210,7 +209,6 @@ class CaptureSamples:
     source: str
     temperature_source: TemperatureSource
     statistics: FrameStatistics
-    info: CaptureInfo
     remarks: tuple[str, ...]
     sessions: tuple[int, ...] = ()
 
@@ -271,7 +269,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     bus = buses[channel]
     if not bus.values:
         raise _without_current(path, vehicle, bus.decoder.statistics)
-    remarks = [*vehicle.remarks, *capture.info.remarks, *_losses(bus.decoder.statistics)]
+    remarks = [*vehicle.remarks, *capture.info["remarks"], *_losses(bus.decoder.statistics)]
     remarks += [*bus.decoder.wrong_periods.values(), *bus.decoder.never_decoded.values()]
     if sum(bool(each.values) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
@@ -292,7 +290,6 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         str(path),
         vehicle.temperature_source,
         bus.decoder.statistics,
-        capture.info,
         tuple(remarks),
         tuple(bus.sessions),
     )

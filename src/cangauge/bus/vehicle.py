@@ -221,7 +221,7 @@ class Vehicle:
         """What a SoC belongs to: messages, bits and sign of current and voltage."""
         parts = []
         for key, codec in ((each.key, each.codec) for each in (self.current, self.voltage)):
-            pages = [(each.field, sorted(each.values)) for each in codec.conditions]
+            pages = [(field, sorted(values)) for field, values in codec.conditions]
             sign = codec.gain * codec.factor > 0.0
             parts.append((key, codec.field, codec.is_signed, codec.float_format, pages, sign))
         return repr(parts)

@@ -138,7 +138,7 @@ def _show_capture(found: CaptureInspection) -> None:
     if found.start_s > _STAMPS_SINCE_1970_S:
         begins = f", from {datetime.fromtimestamp(found.start_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
     say(
-        f"{found.name}: {info.format}, {info.frames:,} frames of {len(found.ids)} ids,"
+        f"{found.name}: {info['format']}, {info['frames']:,} frames of {len(found.ids)} ids,"
         f" {found.duration_s:.1f} s{begins}."
     )
     for preset in found.presets:
@@ -158,7 +158,7 @@ def _show_capture(found: CaptureInspection) -> None:
         gap = max(found.gaps, key=attrgetter("length_s"))
         others = f", the longest of {len(found.gaps)}" if len(found.gaps) > 1 else ""
         say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s{others}.")
-    for line in info.remarks if found.log is None else ():  # the log's hold them
+    for line in info["remarks"] if found.log is None else ():  # the log's hold them
         say(f"Remarks: {line}")
     if found.log is not None:
         _show_log(found.log)

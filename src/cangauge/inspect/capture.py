@@ -17,7 +17,7 @@ import can
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.bus.captures import CaptureInfo, open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.mapping import COUNTER
 from cangauge.bus.protection import RULES, CounterRule, E2eRule, FrameChecker, Protection, Verdict
@@ -89,12 +89,13 @@ class PresetMatch:
 class CaptureInspection:
     """Findings of `inspect_capture`; `log` is the decoded one, with a vehicle.
 
+    `info` is that of `Capture`.
     `time_reversals` are frames stamped earlier than the one before.
     """
 
     name: str
     source: str
-    info: CaptureInfo
+    info: dict[str, Any]
     start_s: float
     duration_s: float
     error_frames: int

@@ -10,7 +10,7 @@ from typing import Final
 import can
 import numpy as np
 
-from cangauge.bus.database import MultiplexCondition
+from cangauge.bus.database import Condition
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
@@ -50,7 +50,7 @@ class FrameEncoder:
             raise InputError(problem, source=vehicle.name, cure=cure)
         self.vehicle = vehicle
         self._counters = dict.fromkeys(vehicle.messages, 0)
-        groups: dict[tuple[int, tuple[MultiplexCondition, ...]], list[VehicleSignal]] = {}
+        groups: dict[tuple[int, tuple[Condition, ...]], list[VehicleSignal]] = {}
         for signal in vehicle.signals:
             groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
         keys = [key for key, _ in groups]

@@ -334,8 +334,7 @@ def estimate_capture(
         str(path),
         settings.temperature_source,
         statistics,
-        capture.info,
-        (*vehicle.remarks, *capture.info.remarks, *remarks, *unseen.values()),
+        (*vehicle.remarks, *capture.info["remarks"], *remarks, *unseen.values()),
     )
     # With a model, another pack's voltage is implausible, and a current that wraps.
     wraps = statistics.messages[vehicle.current.key].implausible > 0

@@ -161,7 +161,7 @@ class _RecordFile:
         exists = os.path.lexists(base) and not self._is_device
         self._base, self._part_bytes, self._keep_bytes = base, part_bytes, keep_bytes
         self._in_parts = part_bytes is not None or exists
-        self._run = max((each.run for each in all_parts(base)), default=0) + 1
+        self._run = max((run for run, _, _ in all_parts(base)), default=0) + 1
         self._part = self._bytes = self.written_bytes = 0
         self.path = run_path(base, self._run) if self._in_parts else base
         self._synced_s = time.monotonic()
@@ -220,7 +220,7 @@ class _RecordFile:
     def _remove_oldest(self) -> None:
         if self._keep_bytes is None:
             return
-        sizes = {each.path: each.path.stat().st_size for each in all_parts(self._base)}
+        sizes = {path: path.stat().st_size for _, _, path in all_parts(self._base)}
         total = sum(sizes.values())
         for path, size in sizes.items():
             if total <= self._keep_bytes:

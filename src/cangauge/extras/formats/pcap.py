@@ -15,8 +15,9 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import can
+from can.io.generic import BinaryIOMessageReader
 
-from cangauge.bus.readers import ERROR_FLAG, MAX_ID, BinaryReader
+from cangauge.bus.readers import ERROR_FLAG, MAX_ID, CaptureReader
 from cangauge.errors import InputError
 
 _CAN, _SLL, _SLL2 = 227, 113, 276
@@ -43,7 +44,7 @@ class _Interface(NamedTuple):
     offset_s: int
 
 
-class PcapReader(BinaryReader):
+class PcapReader(CaptureReader, BinaryIOMessageReader):
     """PCAP, classic and PCAPNG, of SocketCAN interfaces."""
 
     name = "PCAP"

@@ -14,11 +14,12 @@ from typing import Any, ClassVar, Final
 import can
 from can.io import blf
 from can.io.blf import BLFParseError
+from can.io.generic import BinaryIOMessageReader
 from can.util import dlc2len
 
 from cangauge._files import MIB
 from cangauge._text import counted
-from cangauge.bus.readers import MAX_LINE, BinaryReader
+from cangauge.bus.readers import MAX_LINE, CaptureReader
 from cangauge.errors import InputError
 
 _OBJECT: Final = struct.Struct("<8sI4x")
@@ -27,7 +28,7 @@ MAX_CONTAINER: Final = 64 * MIB
 """Largest container of a BLF, unpacked [bytes]; loggers write 128 kB."""
 
 
-class LibraryReader(BinaryReader):
+class LibraryReader(CaptureReader, BinaryIOMessageReader):
     """Reader of a format that python-can reads.
 
     Attributes
