@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar, get_args, get_type_hints
 from pydantic import BaseModel, ValidationError
 
 from cangauge._files import read_bounded
-from cangauge.errors import InputError, closest
+from cangauge.errors import InputError, closest, located
 
 MAX_TOML_BYTES: Final = 64 * 1024
 _LONG_KEY: Final = re.compile(rb"""(?<![\w"'.-])(?:["']?[\w-]+["']?[ \t]*\.[ \t]*){200}""")
@@ -50,14 +50,11 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
 
 def validated(model: type[Model], data: object, source: str | PathLike[str]) -> Model:
     """Check `data` against a model; raise InputError for the first error (see `schema_error`)."""
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        raise schema_error(error, model, source) from error
-    except InputError as error:  # of a table that compares its values
-        raise InputError(
-            error.problem, source=source, field=error.field, value=error.value, cure=error.cure
-        ) from error
+    with located(source):  # an error of a table that compares its values
+        try:
+            return model.model_validate(data)
+        except ValidationError as error:
+            raise schema_error(error, model, source) from error
 
 
 def schema_error(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from itertools import islice
 from numbers import Real
@@ -88,6 +89,21 @@ class InputError(CangaugeError):
                 for char in text
             )
         )
+
+
+@contextmanager
+def located(source: str | PathLike[str] | None, field: str = "") -> Iterator[None]:
+    """Name the file of errors raised within, and put `field` before the field that they name."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(
+            error.problem,
+            source=error.source or source,
+            field=".".join(filter(None, [field, error.field])) or None,
+            value=error.value,
+            cure=error.cure,
+        ) from error
 
 
 _OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)(?: (from-soc)|( (?=['\d])))?")

@@ -19,9 +19,7 @@ def codec(kind: str, *codes: int, more: str = "") -> SignalCodec:
     assert isinstance(database, Database)
     message = database.messages[0]
     signal = message.get_signal_by_name("s")
-    return signal_codec(
-        message, signal, source="x.dbc", field="current", not_available=tuple(codes)
-    )
+    return signal_codec(message, signal, not_available=tuple(codes))
 
 
 @pytest.mark.parametrize("code", [0x8000, -0x8000])
@@ -44,7 +42,7 @@ def test_a_code_of_a_signed_signal_may_be_written_as_its_bits(code: int) -> None
 def test_a_code_that_cannot_occur_is_refused(kind: str, code: int, ends: str) -> None:
     with pytest.raises(InputError, match="never has this code") as caught:
         codec(kind, code)
-    assert caught.value.field == "current.not_available"
+    assert caught.value.field == "not_available"
     assert caught.value.value == code
     assert ends in str(caught.value)
     # In a value table it means nothing: the file is often of a tool.

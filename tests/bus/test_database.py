@@ -20,7 +20,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.database import MAX_DBC_BYTES, SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE
 from cangauge.bus.publish import reason_bits
-from cangauge.errors import InputError
+from cangauge.errors import InputError, located
 from cangauge.types import Reason, Status
 
 
@@ -33,7 +33,8 @@ def dbc(signals: str, length: int = 8, more: str = "") -> Message:
 
 def codec(signals: str, length: int = 8, more: str = "") -> SignalCodec:
     message = dbc(signals, length, more)
-    return signal_codec(message, message.get_signal_by_name("s"), source="x.dbc", field="current")
+    with located("x.dbc", "current"):
+        return signal_codec(message, message.get_signal_by_name("s"))
 
 
 @st.composite
@@ -52,7 +53,7 @@ def layouts(draw: st.DrawFn) -> Message:
 
 @given(layouts(), st.binary(min_size=8, max_size=8))
 def test_decodes_as_cantools_does_and_encoding_inverts_it(message: Message, data: bytes) -> None:
-    found = signal_codec(message, message.signals[0], source="x", field="f")
+    found = signal_codec(message, message.signals[0])
     value = found.decode(data)
     assert value == message.decode(data)["s"]
     assert pickle.loads(pickle.dumps(found)).decode(data) == value  # noqa: S301 - our own
@@ -193,7 +194,7 @@ def test_codec_agrees_with_cantools_on_every_signal(name: str, data: bytes) -> N
         except cantools.database.DecodeError:
             continue  # a multiplexer with a value that no signal belongs to, or a longer reply
         for signal in message.signals:
-            found = signal_codec(message, signal, source=name, field="")
+            found = signal_codec(message, signal)
             assert found.is_in(payload) == (signal.name in expected)
             if signal.name in expected:
                 value, wanted = found.decode(payload), float(expected[signal.name])
@@ -255,7 +256,7 @@ def test_a_multiplexer_that_is_missing_or_its_own_is_refused(tmp_path: Path, lin
     )
     message = load_dbc(path).messages[0]
     with pytest.raises(InputError, match="multiplexer"):
-        signal_codec(message, message.signals[0], source=path, field="current")
+        signal_codec(message, message.signals[0])
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
 from cangauge.bus.dbc_text import prepared
-from cangauge.errors import InputError, closest
+from cangauge.errors import InputError, closest, located
 
 MAX_DBC_BYTES: Final = 4 * MIB
 """Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
@@ -65,18 +65,23 @@ class BitField:
     big_endian: bool
 
     @property
+    def mask(self) -> int:
+        """Largest number that the bits hold."""
+        return (1 << self.width) - 1
+
+    @property
     def order(self) -> Literal["big", "little"]:
         """Byte order, as `int.from_bytes` names it."""
         return "big" if self.big_endian else "little"
 
     def get(self, payload: bytes | bytearray) -> int:
         """Return the bits of a payload."""
-        return (int.from_bytes(payload, self.order) >> self.shift) & ((1 << self.width) - 1)
+        return (int.from_bytes(payload, self.order) >> self.shift) & self.mask
 
     def put(self, payload: bytearray, raw: int) -> None:
         """Set the bits in a payload."""
-        mask = ((1 << self.width) - 1) << self.shift
-        word = int.from_bytes(payload, self.order) & ~mask | ((raw << self.shift) & mask)
+        word = int.from_bytes(payload, self.order) & ~(self.mask << self.shift)
+        word |= (raw & self.mask) << self.shift
         payload[:] = word.to_bytes(len(payload), self.order)
 
     @classmethod
@@ -136,7 +141,7 @@ class SignalCodec:
 
     def _decoder(self) -> Decode:
         """Return `decode`: the kind of the signal is decided here, once, not for each frame."""
-        order, low_bit, mask = self.field.order, self.field.shift, (1 << self.field.width) - 1
+        order, low_bit, mask = self.field.order, self.field.shift, self.field.mask
         factor, offset, gain, shift = self.factor, self.offset, self.gain, self.shift
         not_available, sign_bit = self.not_available, (mask + 1) >> 1 if self.is_signed else 0
         floating = struct.Struct(">" + (self.float_format or "d"))
@@ -192,7 +197,7 @@ class SignalCodec:
     def raw_range(self) -> tuple[int, int]:
         """Smallest and largest raw number."""
         low = -(1 << (self.field.width - 1)) if self.is_signed else 0
-        return low, low + (1 << self.field.width) - 1
+        return low, low + self.field.mask
 
     @property
     def range(self) -> tuple[float, float]:
@@ -251,8 +256,6 @@ def signal_codec(
     message: Message,
     signal: Signal,
     *,
-    source: object,
-    field: str,
     not_available: tuple[int, ...] = (),
     when: dict[str, int] | None = None,
     signed: bool = False,
@@ -261,8 +264,7 @@ def signal_codec(
 
     Parameters
     ----------
-    source, field : object, str
-        For error messages: the file, and the name of the entry in the map file.
+    message, signal : Message, Signal
     not_available : tuple of int
         Raw codes without a value, besides those that the value table names so. That of a signed
         signal may be written as its bits are: 0x8000 is −32768 of 16 bits.
@@ -274,41 +276,21 @@ def signal_codec(
     Raises
     ------
     InputError
-        If the signal does not fit into its message or cannot be a number, or never has a code.
+        If the signal does not fit into its message or cannot be a number, or never has a code; its
+        field is "signal", or the name of the argument.
     """
-
-    def bits_of(each: Signal) -> BitField:
-        bits, conversion = BitField.of(each, message.length), each.conversion
-        problem = ""
-        if each.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
-            problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
-        elif conversion.is_float and each.length not in _FLOATS:
-            problem = f"a float of {each.length} bits is not possible"
-        elif not conversion.is_float and each.length > 64:
-            problem = f"a number of {each.length} bits is not possible"
-        elif not (0.0 < abs(conversion.scale) < math.inf and math.isfinite(conversion.offset)):
-            problem = "factor and offset must be finite and the factor not 0"
-        if problem:
-            where = f"{field}.signal"
-            raise InputError(
-                problem, source=str(source), field=where, value=each.name, cure="correct the DBC"
-            )
-        return bits
-
-    bits = bits_of(signal)
+    bits, conversion = _bits_of(message, signal), signal.conversion
+    is_signed = (signal.is_signed or signed) and not conversion.is_float
     conditions = []
-    for selector, values in _selectors(message, signal, source, field):
-        conditions.append((bits_of(selector), values))
+    for selector, values in _selectors(message, signal):
+        conditions.append((_bits_of(message, selector), values))
     for name, value in (when or {}).items():
         other = _signal(message, name)
         if other is None:
             problem = f"message {message.name} has no such signal"
-            raise InputError(problem, source=str(source), field=f"{field}.when", value=name)
-        other_bits = bits_of(other)
-        raw = value & ((1 << other_bits.width) - 1)
-        conditions.append((other_bits, frozenset({raw})))
-    conversion = signal.conversion
-    is_signed = (signal.is_signed or signed) and not conversion.is_float
+            raise InputError(problem, field="when", value=name)
+        other_bits = _bits_of(message, other)
+        conditions.append((other_bits, frozenset({value & other_bits.mask})))
     return SignalCodec(
         name=signal.name,
         unit=(signal.unit or "").strip(),
@@ -317,43 +299,51 @@ def signal_codec(
         float_format=_FLOATS[signal.length] if conversion.is_float else "",
         factor=float(conversion.scale),
         offset=float(conversion.offset),
-        not_available=_codes(signal, is_signed, not_available, str(source), field),
+        not_available=_codes(signal, is_signed, not_available),
         conditions=tuple(conditions),
     )
 
 
-def _codes(
-    signal: Signal, is_signed: bool, stated: tuple[int, ...], source: str, field: str
-) -> frozenset[int]:
+def _bits_of(message: Message, signal: Signal) -> BitField:
+    """Return the bits of a signal; raise InputError if it does not fit, or is no number."""
+    bits, conversion = BitField.of(signal, message.length), signal.conversion
+    if signal.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
+        problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
+    elif conversion.is_float and signal.length not in _FLOATS:
+        problem = f"a float of {signal.length} bits is not possible"
+    elif not conversion.is_float and signal.length > 64:
+        problem = f"a number of {signal.length} bits is not possible"
+    elif not (0.0 < abs(conversion.scale) < math.inf and math.isfinite(conversion.offset)):
+        problem = "factor and offset must be finite and the factor not 0"
+    else:
+        return bits
+    raise InputError(problem, field="signal", value=signal.name, cure="correct the DBC")
+
+
+def _codes(signal: Signal, is_signed: bool, stated: tuple[int, ...]) -> frozenset[int]:
     """Return the codes of the value table and the stated ones, which must be possible."""
-    width, field = signal.length, f"{field}.not_available"
+    width = signal.length
+    names: Mapping[int, object] = signal.conversion.choices or {}
+    low, end = -(1 << (width - 1)) if is_signed else 0, 1 << width
     for code in stated:
         if signal.conversion.is_float:
             problem, cure = "a float has no codes", "remove it: NaN and infinite are no values"
-            raise InputError(problem, source=source, field=field, value=code, cure=cure)
-        if _as_sent(code, width, is_signed) is None:
+        elif not low <= code < end:
             problem = f"a signal of {width} bits never has this code"
-            low = -(1 << (width - 1)) if is_signed else 0
-            cure = f"state the raw code, within {low} to {(1 << width) - 1}"
-            raise InputError(problem, source=source, field=field, value=code, cure=cure)
-    codes = (_as_sent(code, width, is_signed) for code in (*_codes_of_no_value(signal), *stated))
-    return frozenset(code for code in codes if code is not None)
+            cure = f"state the raw code, within {low} to {end - 1}"
+        else:
+            continue
+        raise InputError(problem, field="not_available", value=code, cure=cure)
+    codes = [*stated]
+    if 2 * len(names) <= 1 << min(width, 64):  # else an enumeration, in which "invalid" is a state
+        codes += [int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name))]
+    # The bits of a signed signal may be stated unsigned, as most value tables do.
+    return frozenset(
+        code - end if is_signed and code >= -low else code for code in codes if low <= code < end
+    )
 
 
-def _as_sent(code: int, width: int, is_signed: bool) -> int | None:
-    """Return a raw code as the number that its bits are in a frame; None if none can be it.
-
-    The bits of a signed signal may be stated unsigned, as most value tables do.
-    """
-    low = -(1 << (width - 1)) if is_signed else 0
-    if not low <= code < 1 << width:
-        return None
-    return code - (1 << width) if is_signed and code >= -low else code
-
-
-def _selectors(
-    message: Message, signal: Signal, source: object, field: str
-) -> Iterator[tuple[Signal, frozenset[int]]]:
+def _selectors(message: Message, signal: Signal) -> Iterator[tuple[Signal, frozenset[int]]]:
     """Yield the multiplexers of a signal with the values that select it, the nearest first."""
     selector = signal
     for _ in message.signals:
@@ -365,21 +355,11 @@ def _selectors(
         selector = above
         yield selector, values
     problem = f"its multiplexer {selector.multiplexer_signal} is missing, or its own"
-    where = f"{field}.signal"
-    raise InputError(
-        problem, source=str(source), field=where, value=signal.name, cure="correct the DBC"
-    )
+    raise InputError(problem, field="signal", value=signal.name, cure="correct the DBC")
 
 
 def _signal(message: Message, name: str) -> Signal | None:
     return next((each for each in message.signals if each.name == name), None)
-
-
-def _codes_of_no_value(signal: Signal) -> frozenset[int]:
-    names: Mapping[int, object] = signal.conversion.choices or {}
-    if 2 * len(names) > 1 << min(signal.length, 64):
-        return frozenset()  # an enumeration, in which "invalid" is a state
-    return frozenset(int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name)))
 
 
 def load_dbc(path: str | PathLike[str], remarks: list[str] | None = None) -> Database:
@@ -425,7 +405,7 @@ def load_dbc(path: str | PathLike[str], remarks: list[str] | None = None) -> Dat
     return database
 
 
-def find_message(database: Database, message: str | int, *, source: object, field: str) -> Message:
+def find_message(database: Database, message: str | int) -> Message:
     """Return the message of that name or id ("PackStatus", 475, "0x1DB").
 
     Raises InputError if there is none (with the closest names) or more than one.
@@ -444,36 +424,37 @@ def find_message(database: Database, message: str | int, *, source: object, fiel
         near = "" if number is not None else closest(str(message), [m.name for m in messages])
         cure = near and f"did you mean {near}?"
         cure = cure or _listed([f"{m.name} (0x{m.frame_id:X})" for m in messages], "messages")
-    raise InputError(problem, source=str(source), field=field, value=message, cure=cure)
+    raise InputError(problem, value=message, cure=cure)
 
 
 def find_signal(
-    database: Database, message: str | int | None, signal: str, *, source: object, field: str
+    database: Database, message: str | int | None, signal: str
 ) -> tuple[Message, Signal]:
     """Return a signal and its message; without a message, the only signal of that name.
 
-    Raises InputError if there is none (with the closest names) or more than one.
+    Raises InputError if there is none (with the closest names) or more than one; its field is
+    "message" or "signal".
     """
-    owners = [each for each in database.messages if _signal(each, signal)]
-    names = [owner.name for owner in owners]
-    problem, cure = "the DBC has no such signal", "check the name in the DBC"
     searched = database.messages
     if message is not None:
-        owner = find_message(database, message, source=source, field=f"{field}.message")
-        if owner in owners:
-            return owner, owner.get_signal_by_name(signal)
-        problem, searched = f"message {owner.name} has no such signal", [owner]
-        cure = _listed([each.name for each in owner.signals], "signals")
-    elif len(owners) == 1:
-        return owners[0], owners[0].get_signal_by_name(signal)
-    if owners and message is None:
-        problem = f"{len(owners)} messages have such a signal ({', '.join(names[:5])})"
+        with located(None, "message"):
+            searched = [find_message(database, message)]
+    found = [each for each in searched if _signal(each, signal)]
+    if len(found) == 1:
+        return found[0], found[0].get_signal_by_name(signal)
+    problem, cure = "the DBC has no such signal", "check the name in the DBC"
+    if message is not None:
+        problem = f"message {searched[0].name} has no such signal"
+        cure = _listed([each.name for each in searched[0].signals], "signals")
+    if found:
+        names = ", ".join(each.name for each in found[:5])
+        problem = f"{len(found)} messages have such a signal ({names})"
         cure = "name the message too"
-    elif owners:
-        cure = f"it is in {', '.join(names[:3])}"
+    elif others := [each.name for each in database.messages if _signal(each, signal)]:
+        cure = f"it is in {', '.join(others[:3])}"
     elif near := closest(signal, (each.name for owner in searched for each in owner.signals)):
         cure = f"did you mean {near}?"
-    raise InputError(problem, source=str(source), field=f"{field}.signal", value=signal, cure=cure)
+    raise InputError(problem, field="signal", value=signal, cure=cure)
 
 
 def _listed(names: list[str], what: str) -> str:

@@ -170,23 +170,12 @@ class MessageMap(_MapTable):
     counter: str | None = None
     counter_modulus: Annotated[int, Field(ge=3, lt=1 << 32)] | None = None
 
-    def rule(
-        self, message: Message, rules: Mapping[str, ProtectionRule], *, source: str
-    ) -> Protection | None:
+    def rule(self, message: Message, rules: Mapping[str, ProtectionRule]) -> Protection | None:
         """Return the protection of a message; None where none is stated.
 
-        `rules` are the user's own, `source` is the file for error messages. Raises InputError if
-        the rule is unknown, does not fit, lacks a field or has one of another protection.
+        `rules` are the user's own. Raises InputError if the rule is unknown, does not fit, lacks a
+        field or has one of another protection.
         """
-        try:
-            return self._rule(message, rules)
-        except InputError as error:
-            where = f"messages.{message.name}.{error.field}"
-            raise InputError(
-                error.problem, source=source, field=where, value=error.value, cure=error.cure
-            ) from error
-
-    def _rule(self, message: Message, rules: Mapping[str, ProtectionRule]) -> Protection | None:
         name, known = self.protection, {**RULES, **rules}
         names = _FIELDS_OF_COUNTER + _FIELDS_OF_PROFILES
         stated = {each: getattr(self, each) for each in names if getattr(self, each) is not None}

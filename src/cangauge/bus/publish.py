@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -106,10 +105,10 @@ _KINDS: Final[dict[str, Callable[[int], int]]] = {
 class _Layout:
     """A message of soc_estimate.dbc: codecs by signal, counter and CRC."""
 
-    def __init__(self, message: Message, path: Path) -> None:
+    def __init__(self, message: Message) -> None:
         self._length = message.length
         self._codecs = {
-            signal.name: signal_codec(message, signal, source=path, field=message.name)
+            signal.name: signal_codec(message, signal)
             for signal in message.signals
             if not signal.name.startswith(("counter_", "crc_"))
         }
@@ -133,9 +132,8 @@ class _Layout:
 
 
 def _layouts(ids: FrameIds) -> dict[str, _Layout]:
-    path = shared_file("dbc", "soc_estimate.dbc")
-    message = load_dbc(path).get_message_by_name
-    return {name: _Layout(message(name.upper()), path) for name in ids.published.values()}
+    message = load_dbc(shared_file("dbc", "soc_estimate.dbc")).get_message_by_name
+    return {name: _Layout(message(name.upper())) for name in ids.published.values()}
 
 
 class SocPublisher:

@@ -31,7 +31,7 @@ from cangauge.bus.isotp import READ_BY_IDENTIFIER, PollTarget, reply_id, reply_s
 from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
-from cangauge.errors import InputError, closest, require_temperature
+from cangauge.errors import InputError, closest, located, require_temperature
 from cangauge.logs.quantities import convert
 from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource
 
@@ -335,7 +335,8 @@ class _Binder:
         errors = []
         for database, file in self._databases:
             try:
-                return find(database, *names, source=file, field=field), file
+                with located(file, field):
+                    return find(database, *names), file
             except InputError as error:
                 errors.append(error)
         raise errors[0]
@@ -345,15 +346,14 @@ class _Binder:
 
     def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
         (message, signal), file = self._in_first(find_signal, role, wanted.message, wanted.signal)
-        codec = signal_codec(
-            message,
-            signal,
-            source=file,
-            field=role,
-            not_available=wanted.not_available,
-            when=wanted.when,
-            signed=wanted.signed,
-        )
+        with located(file, role):
+            codec = signal_codec(
+                message,
+                signal,
+                not_available=wanted.not_available,
+                when=wanted.when,
+                signed=wanted.signed,
+            )
         key = _key(message)
         self._messages[key] = message
         factor, offset = (1.0, 0.0) if wanted.states_unit else self._unit(role, codec)
@@ -395,39 +395,29 @@ class _Binder:
             # In some DBC files it is not a number.
             if period_s is None and isinstance(cycle_ms, int | float) and 0 < cycle_ms < math.inf:
                 period_s = cycle_ms / 1000.0
-            rule = each.rule(message, self._mapping.rules, source=self._source)
-            self._refuse_kind(message, each)
+            with located(self._source, f"messages.{message.name}"):
+                rule = each.rule(message, self._mapping.rules)
+                self._refuse_kind(message, each)
             is_reply = each.isotp or each.uds
             reply = reply_start(message.frame_id, each.uds) if is_reply else b""
             protections[key] = MessageProtection(rule, period_s, reply, each.j1939, each.request_id)
         return protections
 
-    def _refuse_kind(self, message: Message, stated: MessageMap) -> None:
+    @staticmethod
+    def _refuse_kind(message: Message, stated: MessageMap) -> None:
         """Raise InputError if the message's id cannot be what the map says of it."""
-        number, where = message.frame_id, f"messages.{message.name}"
+        number = message.frame_id
         for kind, example in _EXTENDED_KINDS.items():
             if getattr(stated, kind) and not message.is_extended_frame:
                 problem = f"{kind} needs an extended id"
                 cure = f"give it that number in the DBC, as {example}"
-                raise InputError(
-                    problem,
-                    source=self._source,
-                    field=f"{where}.{kind}",
-                    value=f"0x{number:X}",
-                    cure=cure,
-                )
+                raise InputError(problem, field=kind, value=f"0x{number:X}", cure=cure)
         if stated.isotp and not stated.uds and number >> 8 & 0xFF == READ_BY_IDENTIFIER:
             sender = f"0x{reply_id(number):X}"
             problem = "replies that begin with 62 differ in two further bytes"
             cure = f"state uds = true, and number it {sender} and both bytes: {sender}0101 for"
             cure += " 62 01 01"
-            raise InputError(
-                problem,
-                source=self._source,
-                field=f"{where}.isotp",
-                value=f"0x{number:X}",
-                cure=cure,
-            )
+            raise InputError(problem, field="isotp", value=f"0x{number:X}", cure=cure)
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""

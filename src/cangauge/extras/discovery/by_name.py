@@ -190,7 +190,7 @@ class _NamedFrames:
         """Yield the signals that fit into the message, with their values."""
         for signal in message.signals:
             with suppress(InputError):
-                codec = signal_codec(message, signal, source="", field=signal.name)
+                codec = signal_codec(message, signal)
                 yield self._signal(message, signal, codec)
 
     def _signal(self, message: Message, signal: Signal, codec: SignalCodec) -> _NamedSignal:

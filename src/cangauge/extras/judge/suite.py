@@ -24,7 +24,7 @@ import numpy as np
 from cangauge._resources import shared_file
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.database import find_message, load_dbc, signal_codec
+from cangauge.bus.database import find_signal, load_dbc, signal_codec
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.time_source import MICROSECONDS, clock_frame
 from cangauge.bus.vehicle import Vehicle
@@ -217,14 +217,11 @@ class _Gauge:
         self, bus: BusConnection, address: BusAddress, folder: Path, command: Sequence[str]
     ) -> None:
         self._bus, self._address, self._folder, self._command = bus, address, folder, command
-        path = shared_file("dbc", "soc_estimate.dbc")
-        message = find_message(load_dbc(path), "SOC_ESTIMATE", source=path, field="SOC_ESTIMATE")
-        signals = {signal.name: signal for signal in message.signals}
-        self._id = message.frame_id
-        self._codecs = [
-            signal_codec(message, signals[name], source=path, field=name)
-            for name in ("soc_pct", "soc_std_pct")
-        ]
+        database = load_dbc(shared_file("dbc", "soc_estimate.dbc"))
+        names = ("soc_pct", "soc_std_pct")
+        found = [find_signal(database, "SOC_ESTIMATE", name) for name in names]
+        self._id = found[0][0].frame_id
+        self._codecs = [signal_codec(message, signal) for message, signal in found]
         self._vehicle = Vehicle.load("generic")
         self._was_ready = False
         self._answers_a_sample = 1.0
