@@ -27,6 +27,7 @@ from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.pipeline import NOTHING_YET, PipelineSettings
 from cangauge.service.record import Recorder
 from live import (
+    PATIENCE_S,
     Service,
     leaf_model,
     never,
@@ -125,11 +126,15 @@ def test_a_missing_receiver_is_an_error_of_one_line() -> None:
 
 def test_a_service_for_another_vehicle_is_an_error() -> None:
     settings = ReplaySettings(speed=math.inf, acknowledge_s=0.5)
+    source = LogSource(short_log(100.0), Vehicle.load("generic"))
     with (
+        virtual_port("other", SOC_FRAMES) as port,
+        virtual_port("other", [standard_filter(0x5A1)]) as other,
         virtual_service("other", REPLAYED, vehicle=Vehicle.load("leaf_aze0")),
-        pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"),
     ):
-        play_log("other", 100.0, settings)
+        assert other.receive(PATIENCE_S)  # the player waits less than SOC_DETAIL's interval
+        with pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"):
+            play(port, source, settings, stop=never)
 
 
 def test_a_second_sender_on_the_bus_is_an_error() -> None:
