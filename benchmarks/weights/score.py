@@ -75,7 +75,7 @@ def _example(split: Split, logs: Sequence[Log], truth: dict, model: Model, healt
         "better": answer.extended_rmse_v <= answer.baseline_rmse_v,
         "covers": _covers(answer, truth),
     }
-    case = features(healthy, answer.evidence)
+    case = features(healthy, answer.rows, answer.evidence)
     return Example(split.pack, split.world, case, truth, len(logs), len(split.references), found)
 
 
@@ -88,7 +88,7 @@ def _covers(answer, truth: dict) -> bool | None:  # type: ignore[no-untyped-def,
     if answer.best_of(fault).shape.effect.id != effect:
         return None
     name, factor = SIZED[effect]
-    low, high = answer.parameters(fault)[name].ci
+    low, high = answer.best_of(fault).parameters[name].ci
     return bool(low <= factor * truth["size"] <= high)
 
 

@@ -118,8 +118,10 @@ def models(data: Path) -> Table:
         for label, wrong in _wrong_models(model).items():
             check = diagnose(logs, wrong, references).model_check
             missed = "; ".join(
-                f"{each.effect} "
-                + ", ".join(f"{v.value:.3g} {v.unit}" for v in each.parameters.values() if v.ci)
+                f"{each.evidence.shape.effect.id} "
+                + ", ".join(
+                    f"{v.value:.3g} {v.unit}" for v in each.evidence.parameters.values() if v.ci
+                )
                 for each in check.missed
             )
             after = check.missed[-1].rmse_v if check.missed else check.references_rmse_v

@@ -77,7 +77,7 @@ def test_a_late_current_is_named_and_sized(model: Model, known: Healthy) -> None
         known,
     )
     assert found.posterior.stated[0] == "clock"
-    ci = found.parameters("clock")["skew_s"].ci
+    ci = found.best_of("clock").parameters["skew_s"].ci
     assert ci is not None
     assert ci[0] <= 0.5 <= ci[1]
     assert found.is_written

@@ -52,9 +52,6 @@ def test_posterior_and_evidence_are_those_of_the_dense_formula(seed: int, n: int
     posterior = (Rows.of(X, y, std) + Rows.prior(prior_std)).posterior()
     right = dense(X, y, np.diag(std**2), prior_std)
     check(posterior, right, prior_std)
-    np.testing.assert_allclose(
-        posterior.std_of(X), np.sqrt(np.einsum("ni,ij,nj->n", X, right.covariance, X)), rtol=1e-4
-    )
 
 
 @settings(max_examples=30, deadline=None)

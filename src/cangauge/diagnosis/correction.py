@@ -4,44 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
 
-import numpy as np
-
+from cangauge._typing import BoolArray
 from cangauge._version import __version__
-from cangauge.diagnosis.evidence import EffectEvidence
-from cangauge.diagnosis.faults import Quantity
+from cangauge.diagnosis.evidence import Evidence
 from cangauge.diagnosis.pack import LogRows
 from cangauge.diagnosis.rows import Simulated, added
-from cangauge.diagnosis.sizes import HeldOut, shape_in_log
+from cangauge.diagnosis.sizes import SizeProfile
 from cangauge.diagnosis.where import LogErrors, rms
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
-
-TWO_SIDED: Final = 1.96
-"""Standard deviations of a 95 % interval."""
-
-SHAPE_STD: Final = 0.05
-"""Relative uncertainty of a size by the shape, which is the library's and not the pack's: on
-development cases with much evidence sizes were off by 1 to 15 %."""
-
-
-def parameters_of(evidence: EffectEvidence, duration_s: float) -> dict[str, Quantity]:
-    """Return an effect's parameters with the 95 % interval of its amplitude."""
-    shape = evidence.shape
-    part = next((part for part in evidence.in_logs if part is not None), 0.0)
-    if shape.place is not None:
-        shape = shape.at(part, duration_s)
-    half = TWO_SIDED * float(np.hypot(evidence.std, SHAPE_STD * evidence.size))
-    values = shape.values(evidence.size)
-    found = {}
-    for item in shape.effect.parameters:
-        value, ci = values[item.name], None
-        if item.name == shape.name:
-            ci = (value - half, value + half)
-        found[item.name] = Quantity(value, item.unit, ci)
-    return found
 
 
 def errors_without(
@@ -74,36 +47,34 @@ class Correction:
 
     Parameters
     ----------
-    evidence : EffectEvidence
+    evidence : Evidence
     errors : list of LogErrors
         Before and after, on the rows that count, sized without them.
     """
 
-    evidence: EffectEvidence
+    evidence: Evidence
     errors: list[LogErrors] = field(repr=False)
 
     @classmethod
     def of(
         cls,
-        held_out: HeldOut,
+        parts: Sequence[tuple[SizeProfile, list[BoolArray]]],
         logs: Sequence[LogRows],
         given: Sequence[Simulated],
         without: Sequence[LogErrors],
-        evidence: EffectEvidence,
+        evidence: Evidence,
     ) -> Correction:
-        """Return the correction by an effect, judged on rows that did not size it."""
-        sizes, errors = held_out.sizes(evidence), []
-        for number, (log, of, before) in enumerate(zip(logs, given, without, strict=True)):
-            after_v = before.before_v.copy()
-            shape = shape_in_log(evidence, number, log)
-            if shape is None:
-                errors.append(before)
-                continue
-            for size in np.unique(sizes[number]):
-                mine = sizes[number] == size
-                found = of.with_effect(shape.effect, shape.values(float(size)))
-                after_v[mine] = found.residual_v[log.kept][mine]
-            errors.append(replace(before, after_v=after_v))
+        """Return the correction by an effect, judged on parts of logs that did not size it."""
+        bound = evidence.shape.bound
+        after = [each.before_v.copy() for each in without]
+        for profile, judged in parts:
+            size = profile.newton(evidence, evidence.size / bound) * bound
+            for k, rows in enumerate(judged):
+                shape = evidence.shape_in(k, logs[k])
+                if shape is not None and rows.any():
+                    found = given[k].with_effect(shape.effect, shape.values(size))
+                    after[k][rows] = found.residual_v[logs[k].kept][rows]
+        errors = [replace(each, after_v=v) for each, v in zip(without, after, strict=True)]
         return cls(evidence, errors)
 
     @property
@@ -119,7 +90,7 @@ class Correction:
     @property
     def fault(self) -> str:
         """The fault that it corrects."""
-        return self.evidence.shape.effect.fault
+        return self.evidence.fault
 
     @property
     def is_of_log(self) -> bool:

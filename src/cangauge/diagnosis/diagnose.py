@@ -13,24 +13,19 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
-from cangauge._files import file_sha256, text_sha256
 from cangauge.diagnosis import text
+from cangauge.diagnosis.as_json import as_json
 from cangauge.diagnosis.checks import check_logs
-from cangauge.diagnosis.correction import (
-    Correction,
-    errors_without,
-    model_file,
-    parameters_of,
-)
-from cangauge.diagnosis.evidence import EffectEvidence, Evidence, analyse, learn
-from cangauge.diagnosis.faults import FAULT, Began, Quantity, sentence
+from cangauge.diagnosis.correction import Correction, errors_without, model_file
+from cangauge.diagnosis.evidence import Evidence, analyse, learn
+from cangauge.diagnosis.faults import FAULT, sentence
 from cangauge.diagnosis.model_check import ModelCheck, check_model
-from cangauge.diagnosis.next_step import NextStep, next_step
+from cangauge.diagnosis.next_step import next_step
 from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
 from cangauge.diagnosis.posterior import ALARM, Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
-from cangauge.diagnosis.sizes import HeldOut, simulated
+from cangauge.diagnosis.sizes import held_out, simulated
 from cangauge.diagnosis.where import LogErrors, closed_part, excesses, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
@@ -72,7 +67,7 @@ class Diagnosis:
     """What the references show."""
     rows: tuple[LogRows, ...] = field(repr=False)
     """Of each diagnosed log."""
-    evidence: Evidence = field(repr=False)
+    evidence: dict[str, Evidence] = field(repr=False)
     """Of every effect."""
     posterior: Posterior
     """Probabilities of `none`, `unknown` and every fault, and what follows from them."""
@@ -113,41 +108,21 @@ class Diagnosis:
     @cached_property
     def corrections(self) -> dict[str, Correction]:
         """Fault → its best effect, judged on rows that did not size it."""
-        held_out, (given, without) = HeldOut(self.healthy, self.rows), self._without
-        found = {}
-        for fault in self.posterior.faults:
-            of = self.best_of(fault)
-            found[fault] = Correction.of(held_out, self.rows, given, without, of)
-        return found
+        parts, (given, without) = held_out(self.healthy, self.rows), self._without
+        return {
+            fault: Correction.of(parts, self.rows, given, without, self.best_of(fault))
+            for fault in self.posterior.faults
+        }
 
-    def best_of(self, fault: str) -> EffectEvidence:
+    def best_of(self, fault: str) -> Evidence:
         """Return the evidence of the most probable effect of a fault."""
-        return self.evidence.effects[next(iter(self.posterior.effects(fault)))]
+        return self.evidence[next(iter(self.posterior.effects(fault)))]
 
-    def parameters(self, fault: str) -> dict[str, Quantity]:
-        """Return the parameters of the best effect of a fault, with 95 % intervals."""
-        return parameters_of(self.best_of(fault), self.rows[0].trace.log.duration_s)
-
-    def sentence(self, fault: str) -> str:
-        """Return what a fault does and how much, without the end of the sentence."""
-        pack = self.healthy.linear.pack
-        return sentence(self.best_of(fault), self.parameters(fault), pack, self._began)
-
-    @property
-    def _began(self) -> Began:
+    def sentence(self, evidence: Evidence, model: ExtendedModel | None = None) -> str:
+        """Return what an effect does to a model and how much, without the end of the sentence."""
         log = "The log" if len(self.rows) == 1 else "The first log"
-        return Began(log, self.rows[0].trace.start_pct)
-
-    @property
-    def missed_sentences(self) -> list[str]:
-        """What the model misses on the healthy logs, a sentence each without its end."""
-        if self.model_check is None:
-            return []
-        pack = self.model.extended_model().pack
-        return [
-            sentence(each.evidence.effects[each.effect], each.parameters, pack, self._began)
-            for each in self.model_check.missed
-        ]
+        pack = (model or self.healthy.linear.model).pack
+        return sentence(evidence, pack, log, self.rows[0].trace.start_pct)
 
     @cached_property
     def correction(self) -> Correction | None:
@@ -262,15 +237,15 @@ class Diagnosis:
         return excesses(self._baseline, self.model.capacity_ah)
 
     @cached_property
-    def next_step(self) -> NextStep | None:
-        """The measurement that settles the fault; None where none is stated."""
+    def next_step(self) -> tuple[str, float, float] | None:
+        """Stated fault to measure, with P(truth) now and after; None where none is stated."""
         return next_step(self.evidence, self.posterior)
 
     @property
     def check_first(self) -> str:
         """What to do first, in a sentence."""
         if self.next_step is not None:
-            return self.next_step.instruction
+            return FAULT[self.next_step[0]].instruction
         if self.posterior.level == "none":
             if self.posterior.leans_to_fault:
                 return "Nothing to repair yet: diagnose one more log like these with them."
@@ -282,7 +257,7 @@ class Diagnosis:
 
     def visible_from(self, effect: str) -> tuple[float | None, str]:
         """Return the smallest size of an effect that these logs would have shown, and its unit."""
-        of = self.evidence.effects[effect]
+        of = self.evidence[effect]
         size, unit = of.visible, of.shape.unit
         if effect == "resistance_growth":
             size, unit = size * self.healthy.linear.pack.resistance_ohm, "ohm"
@@ -331,107 +306,7 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that `cangauge gap --json` prints (schema 4)."""
-        closed, ci = self.closed
-        before_pct, after_pct = self.soc_errors_pct or (None, None)
-        answer = self.posterior
-        return {
-            "schema": 4,
-            "model": self._model_json(),
-            "gap": {
-                "baseline_rmse_v": self.baseline_rmse_v,
-                "extended_rmse_v": self.extended_rmse_v,
-                "healthy_rmse_v": self.healthy_rmse_v,
-                "closed_fraction": closed,
-                "closed_fraction_ci": ci and list(ci),
-                "on": "left-out log" if len(self.logs) > 1 else "left-out rows",
-                "baseline_soc_mae_pct": before_pct,
-                "extended_soc_mae_pct": after_pct,
-            },
-            "where": self.where,
-            "answer": {
-                "level": answer.level,
-                "probability_none": answer.none,
-                "probability_unknown": answer.unknown,
-                "stated": list(answer.stated),
-                "text": self.summary,
-                "check_first": self.check_first,
-            },
-            "faults": [self._fault_json(fault) for fault in answer.faults],
-            "next_step": None if self.next_step is None else self.next_step.to_dict(),
-            "correction": {
-                "accepted": self.is_written,
-                "why_not": self.why_not,
-                "path": self.correction_path if self.is_written else None,
-            },
-            "caveats": self.caveats,
-            "inputs": {
-                "model": {
-                    "name": self.model.name,
-                    "sha256": text_sha256(self.model.to_json()),
-                },
-                "logs": _files(self.logs),
-                "references": _files(self.references),
-            },
-        }
-
-    def _model_json(self) -> dict[str, Any]:
-        check = self.model_check
-        if check is None:
-            return {
-                "describes_references": None,
-                "references_rmse_v": None,
-                "among_themselves_rmse_v": None,
-                "faults": [],
-            }
-        return {
-            "describes_references": check.describes,
-            "references_rmse_v": check.references_rmse_v,
-            "among_themselves_rmse_v": check.among_themselves_rmse_v,
-            "faults": [
-                {
-                    "fault": each.fault,
-                    "probability": each.posterior.faults[each.fault],
-                    "effect": each.effect,
-                    "effect_probability": each.posterior.probabilities[each.effect],
-                    "parameters": _plain(each.parameters),
-                    "rmse_v": each.rmse_v,
-                    "closed_fraction": None,
-                    "visible_from": {"size": None, "unit": _unit(each.parameters)},
-                }
-                for each in check.missed
-            ],
-        }
-
-    def _fault_json(self, fault: str) -> dict[str, Any]:
-        correction, effect = self.corrections[fault], self.best_of(fault).shape.effect.id
-        closed, _ = closed_part(correction.errors, self.healthy.healthy_v2)
-        size, unit = self.visible_from(effect)
-        return {
-            "fault": fault,
-            "title": FAULT[fault].title,
-            "probability": self.posterior.faults[fault],
-            "effect": effect,
-            "effect_probability": self.posterior.probabilities[effect],
-            "parameters": _plain(self.parameters(fault)),
-            "rmse_v": correction.rmse_v,
-            "closed_fraction": closed,
-            "visible_from": {"size": size, "unit": unit},
-        }
-
-
-def _plain(parameters: dict[str, Quantity]) -> dict[str, Any]:
-    return {
-        name: {"value": item.value, "ci": item.ci and list(item.ci), "unit": item.unit}
-        for name, item in parameters.items()
-    }
-
-
-def _unit(parameters: dict[str, Quantity]) -> str:
-    return next(item.unit for item in parameters.values() if item.ci is not None)
-
-
-def _files(logs: Sequence[Log]) -> list[dict[str, Any]]:
-    return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
+        return as_json(self)
 
 
 def diagnose(
@@ -514,7 +389,7 @@ def diagnose(
             healthy=healthy,
             rows=rows,
             evidence=evidence,
-            posterior=posterior(healthy, evidence, alarm),
+            posterior=posterior(healthy, rows, evidence, alarm),
             model_check=check,
             remarks=tuple(remarks),
             has_references=bool(healthy.references),

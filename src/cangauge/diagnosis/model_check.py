@@ -8,14 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from cangauge.diagnosis.correction import parameters_of
 from cangauge.diagnosis.evidence import Evidence, analyse
-from cangauge.diagnosis.faults import Quantity
 from cangauge.diagnosis.pack import Healthy, log_rows, of_model
 from cangauge.diagnosis.posterior import Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, added
 from cangauge.diagnosis.sizes import simulated
-from cangauge.model.effects.library import LIBRARY, effect_entries
+from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 
@@ -34,9 +32,6 @@ class Missed:
 
     evidence: Evidence
     posterior: Posterior
-    fault: str
-    effect: str
-    parameters: dict[str, Quantity]
     rmse_v: float
     """Error of the references with it [V]."""
 
@@ -89,26 +84,23 @@ def check_model(model: Model, healthy: Healthy) -> ModelCheck:
         )
         logs = [log_rows(alone.linear, log, alone.tried, []) for log in references]
         evidence = simulated(alone, logs, analyse(alone, logs))
-        answer = posterior(alone, evidence)
-        tried = {}
-        for name, of in evidence.effects.items():
-            if of.shape.effect.fault not in OF_LOGS:
-                with_it = added(extended, of.shape.effect, of.shape.values(of.size))
-                tried[name] = _rmse_v(with_it, references), with_it
+        answer = posterior(alone, logs, evidence)
+        left_v, changed = {}, {}
+        for name, of in evidence.items():
+            if of.fault not in OF_LOGS:
+                changed[name] = added(extended, of.shape.effect, of.shape.values(of.size))
+                left_v[name] = _rmse_v(changed[name], references)
         # Of those that suffice the most probable; else what closes most.
-        enough = {name for name, (left_v, _) in tried.items() if left_v <= BEYOND * expected_v}
+        enough = [name for name, v in left_v.items() if v <= BEYOND * expected_v]
         if enough:
-            effect = max(enough, key=lambda name: answer.probabilities[name])
+            effect = max(enough, key=answer.probabilities.__getitem__)
         else:
-            effect = min(tried, key=lambda name: tried[name][0])
-        with_it_v, changed = tried[effect]
-        of, fault = evidence.effects[effect], LIBRARY[effect].fault
-        if with_it_v >= rmse_v:
+            effect = min(left_v, key=left_v.__getitem__)
+        if left_v[effect] >= rmse_v:
             break
-        now = now.model_copy(update={"effects": effect_entries(changed.effects)})
-        parameters = parameters_of(of, references[0].log.duration_s)
-        found.append(Missed(evidence, answer, fault, effect, parameters, with_it_v))
-        extended, rmse_v = changed, with_it_v
+        extended, rmse_v = changed[effect], left_v[effect]
+        now = now.model_copy(update={"effects": effect_entries(extended.effects)})
+        found.append(Missed(evidence[effect], answer, rmse_v))
     return ModelCheck(before_v, among_v, expected_v, tuple(found), extended)
 
 
@@ -117,7 +109,7 @@ def _expected_v(model: Model, healthy: Healthy) -> float:
     alone = of_model(model)
     logs = [log_rows(alone.linear, log, (), []) for log in healthy.references]
     plain = replace(alone, tried=(), known=alone.known.with_columns(range(alone.linear.p)))
-    open_v2 = float(np.mean([plain.open_v2(log) for log in logs]))
+    open_v2 = float(np.mean([plain.open_v2([log]) for log in logs]))
     return float(np.sqrt(healthy.healthy_v2 + open_v2 + model.noise.level_std_v**2))
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 
 from cangauge.diagnosis.evidence import Evidence
-from cangauge.diagnosis.faults import FAULT
 from cangauge.diagnosis.posterior import Posterior
 
 RESOLUTION: Final = 0.025
@@ -17,57 +16,28 @@ NODES: Final = 7
 """Readings over which an expectation is taken (Gauss–Hermite)."""
 
 
-@dataclass(frozen=True)
-class NextStep:
-    """A measurement, and what it is expected to bring.
+def next_step(
+    evidence: Mapping[str, Evidence], posterior: Posterior
+) -> tuple[str, float, float] | None:
+    """Return the stated fault to measure; None where none is stated.
 
-    Parameters
-    ----------
-    measurement, instruction : str
-    between : (str, str or None)
-        The faults to tell apart; the second is None where one is stated.
-    before, after : float
-        Probability of the true fault among these, today and after the measurement.
+    With it the probability of the truth among the stated faults, now and after the measurement.
     """
-
-    measurement: str
-    instruction: str
-    between: tuple[str, str | None]
-    before: float
-    after: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the step as in `gap --json`."""
-        return {
-            "measurement": self.measurement,
-            "between": list(self.between),
-            "probability_now": self.before,
-            "probability_after": self.after,
-        }
-
-
-def next_step(evidence: Evidence, posterior: Posterior) -> NextStep | None:
-    """Return the measurement that settles the stated fault; None where none is stated."""
     if not posterior.stated:
         return None
-    first = posterior.stated[0]
-    second = posterior.stated[1] if len(posterior.stated) > 1 else None
-    tried = []
-    for fault in posterior.stated:
-        before, after = _expected(evidence, posterior, fault)
-        tried.append((after, before, fault))
-    after, before, fault = max(tried)
-    words = FAULT[fault]
-    return NextStep(words.measurement, words.instruction, (first, second), before, after)
+    tried = {fault: _expected(evidence, posterior, fault) for fault in posterior.stated}
+    after, before, fault = max((after, before, fault) for fault, (before, after) in tried.items())
+    return fault, before, after
 
 
-def _expected(evidence: Evidence, posterior: Posterior, measured: str) -> tuple[float, float]:
+def _expected(
+    evidence: Mapping[str, Evidence], posterior: Posterior, measured: str
+) -> tuple[float, float]:
     """Return the probability of the truth among the stated faults, now and after a measurement.
 
     A measurement reads the size of its fault, and nothing of the others.
     """
-    effect = next(iter(posterior.effects(measured)))
-    of = evidence.effects[effect]
+    of = evidence[next(iter(posterior.effects(measured)))]
     resolution = of.shape.usual or RESOLUTION * of.shape.bound
     spread = float(np.hypot(resolution, of.std))
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)

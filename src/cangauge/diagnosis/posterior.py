@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
+from operator import itemgetter
 from typing import Any, Final, get_args
 
 import numpy as np
@@ -28,7 +29,7 @@ from scipy.special import logsumexp
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.evidence import Evidence
-from cangauge.diagnosis.pack import Healthy
+from cangauge.diagnosis.pack import Healthy, LogRows
 from cangauge.model.effects.base import FaultName
 from cangauge.model.effects.library import LIBRARY
 
@@ -41,8 +42,6 @@ ALARM: Final = 0.05
 """Probability of `none` up to which a gap is reported."""
 LIKELY: Final = 0.2
 """Probability of `none` up to which a gap is called likely: odds of 4 to 1."""
-SHAPE: Final = 0.6
-"""Part of its fault from which a shape is named."""
 
 UNTESTED: Final = 3.0
 """A healthy log may have this many times the error that a model file states: it is of other logs,
@@ -73,21 +72,28 @@ class Features:
     outer: FloatArray
 
 
-def features(healthy: Healthy, evidence: Evidence) -> Features:
+def features(
+    healthy: Healthy, logs: Sequence[LogRows], evidence: Mapping[str, Evidence]
+) -> Features:
     """Return what the posterior sees of a case."""
-    v = healthy.healthy_v2 + max(evidence.open_v2 - healthy.known_v2, 0.0)
-    excess = {name: healthy.excess_of(name) for name in evidence.effects}
-    n_max = max(max(e.nats, 0.0) * excess[name] for name, e in evidence.effects.items())
+    v = healthy.healthy_v2 + max(healthy.open_v2(logs) - healthy.known_v2, 0.0)
+    nats = {name: max(e.nats, 0.0) for name, e in evidence.items()}
+    n_max = max(nats[name] * healthy.excess_of(name) for name in nats)
     effects = {}
-    for name, e in evidence.effects.items():
-        nats = max(e.nats, 0.0)
-        lacking = n_max / excess[name] - nats
-        effects[name] = (math.log1p(nats), -math.log1p(e.left_v2 / v), -math.log1p(lacking))
-    best = max(effects, key=lambda name: sum(effects[name][:2]))
-    most = max(each[0] for each in effects.values())
+    for name, e in evidence.items():
+        lacking = n_max / healthy.excess_of(name) - nats[name]
+        effects[name] = (
+            math.log1p(nats[name]),
+            -math.log1p(e.left_v2 / v),
+            -math.log1p(lacking),
+        )
+    explained = {name: each[0] + each[1] for name, each in effects.items()}
+    best = max(explained, key=explained.__getitem__)
+    most = math.log1p(max(nats.values()))
     usual = float(np.mean(np.log1p(healthy.nats))) if healthy.nats else math.log1p(UNTESTED)
-    gap = math.log(evidence.gap_v2 / v) - (0.0 if healthy.nats else 2.0 * math.log(UNTESTED))
-    left = math.log(evidence.effects[best].left_v2 / v + 0.1)
+    gap = math.log(healthy.gap_v2(logs) / v)
+    gap -= 0.0 if healthy.nats else 2.0 * math.log(UNTESTED)
+    left = math.log(evidence[best].left_v2 / v + 0.1)
     return Features(effects, np.array([left, most, most - usual, gap, 1.0]))
 
 
@@ -155,13 +161,16 @@ class Posterior:
         for name, p in self.probabilities.items():
             if name in LIBRARY:
                 sums[LIBRARY[name].fault] += p
-        return dict(sorted(sums.items(), key=lambda item: -item[1]))
+        return dict(sorted(sums.items(), key=itemgetter(1), reverse=True))
 
     def effects(self, fault: str) -> dict[str, float]:
         """Return the probability of each effect of a fault, most probable first."""
-        mine = {name: p for name, p in self.probabilities.items() if name in LIBRARY}
-        mine = {name: p for name, p in mine.items() if LIBRARY[name].fault == fault}
-        return dict(sorted(mine.items(), key=lambda item: -item[1]))
+        mine = {
+            name: p
+            for name, p in self.probabilities.items()
+            if name in LIBRARY and LIBRARY[name].fault == fault
+        }
+        return dict(sorted(mine.items(), key=itemgetter(1), reverse=True))
 
     @property
     def level(self) -> str:
@@ -188,7 +197,12 @@ class Posterior:
         return self.faults[fault] / max(1.0 - self.none, 1e-12)
 
 
-def posterior(healthy: Healthy, evidence: Evidence, alarm: float = ALARM) -> Posterior:
+def posterior(
+    healthy: Healthy,
+    logs: Sequence[LogRows],
+    evidence: Mapping[str, Evidence],
+    alarm: float = ALARM,
+) -> Posterior:
     """Return the posterior of a case by the weights that ship."""
     by = shipped_weights()
-    return Posterior(probabilities(features(healthy, evidence), by), alarm, by["stated"])
+    return Posterior(probabilities(features(healthy, logs, evidence), by), alarm, by["stated"])

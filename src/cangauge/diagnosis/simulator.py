@@ -16,7 +16,7 @@ import numpy as np
 
 from cangauge._text import significant
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.faults import Quantity
+from cangauge.diagnosis.evidence import Evidence
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
@@ -89,7 +89,11 @@ def _pybamm_v(simulation: Any, log: Log, start_pct: float) -> FloatArray:
     amperes = np.append(log.current_a, log.current_a[-1])
     values["Current function [A]"] = pybamm.Interpolant(after_s, amperes, pybamm.t)
     kelvin = np.append(log.temperature_c, log.temperature_c[-1]) + 273.15
-    values["Ambient temperature [K]"] = lambda _y, _z, t: pybamm.Interpolant(after_s, kelvin, t)
+
+    def ambient_k(_y: Any, _z: Any, t: Any) -> Any:
+        return pybamm.Interpolant(after_s, kelvin, t)
+
+    values["Ambient temperature [K]"] = ambient_k
     driven = pybamm.Simulation(simulation.model, parameter_values=values)
     solution = driven.solve([0.0, float(time_s[-1])], t_interp=time_s, initial_soc=0.01 * start_pct)
     return np.asarray(solution["Battery voltage [V]"](t=time_s))
@@ -116,9 +120,10 @@ class SimulatorGap:
         return np.asarray(self.simulated_v[number] + change_v)
 
 
-def correction(effect: str, parameters: Mapping[str, Quantity]) -> str:
+def correction(evidence: Evidence) -> str:
     """Return what to change in a simulator for an effect, in one sentence."""
-    values = {name: item.value for name, item in parameters.items()}
+    effect = evidence.shape.effect.id
+    values = evidence.shape.values(evidence.size)
     factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
     sentence = CORRECTIONS.get(effect, "add the voltage of {effect}")
     return f"To correct the simulator: {sentence.format(effect=effect, factor=factor, **values)}."

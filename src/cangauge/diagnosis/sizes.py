@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.diagnosis.evidence import EffectEvidence, Evidence, soc_row
-from cangauge.diagnosis.pack import RIDGE, Healthy, LogRows
+from cangauge.diagnosis.evidence import Evidence
+from cangauge.diagnosis.pack import RIDGE, Healthy, LogRows, total_s
 from cangauge.diagnosis.shapes import Shape
 
 STEPS, SHRINK, MIN_STEP, MIN_CHANGE = 6, 0.35, 1e-3, 0.02
@@ -33,225 +33,157 @@ FOLDS, BLOCK_S = 4, 240.0
 correlation of the errors."""
 
 
-def shape_in_log(evidence: EffectEvidence, number: int, log: LogRows) -> Shape | None:
-    """Return the shape in one of the diagnosed logs; None before a step of resistance."""
-    part = evidence.in_logs[number]
-    if part is None or evidence.shape.place is None:
-        return None if part is None else evidence.shape
-    return evidence.shape.at(part, log.trace.log.duration_s)
-
-
-class _Block:
-    """One log with δ and its own deviations, on some of its rows."""
-
-    def __init__(self, healthy: Healthy, log: LogRows, inside: BoolArray | None) -> None:
-        self.log = log
-        self.inside = np.ones(log.kept.size, dtype=bool) if inside is None else inside
-        self._weight = np.sqrt(log.trace.weights[log.kept][self.inside] / healthy.s2)
-        own, delta = healthy.fixed_columns(log)
-        noise = np.sqrt(healthy.s2)
-        self._own, self._delta = own[self.inside] / noise, delta[self.inside] / noise
-        self._root = np.linalg.cholesky(self._own.T @ self._own + np.eye(own.shape[1]))
-        self._of_delta = np.linalg.solve(self._root, self._own.T @ self._delta)
-        self.precision = self._delta.T @ self._delta - self._of_delta.T @ self._of_delta
-
-    def products(self, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the products of some vectors over all kept rows, and those with δ."""
-        v = vectors[self.inside] * self._weight[:, None]
-        of_own = np.linalg.solve(self._root, self._own.T @ v)
-        return v.T @ v - of_own.T @ of_own, self._delta.T @ v - self._of_delta.T @ of_own
-
-    def square(self, residual_v: FloatArray, delta: FloatArray) -> float:
-        """Return the sum of squares of a residual less δ, in noise variances."""
-        left = residual_v[self.inside] * self._weight - self._delta @ delta
-        return float(left @ left)
-
-
-@dataclass(frozen=True)
-class _About:
-    """Likelihood of a size about one."""
-
-    chi2: float
-    gradient: float
-    curvature: float
-    delta: FloatArray
-    residuals: list[FloatArray]
-
-
 class SizeProfile:
-    """Likelihood of the size of one effect in some logs, everything else integrated out.
+    """Likelihood of the size of one effect in some logs, δ and the logs' deviations integrated out.
 
     Parameters
     ----------
     healthy : Healthy
     logs : sequence of LogRows
-    numbers : sequence of int
-        The logs that count.
-    inside : sequence of BoolArray, optional
-        The kept rows of each that count.
+    inside : sequence of BoolArray
+        The rows that count of each log, among those kept.
     """
 
     def __init__(
-        self,
-        healthy: Healthy,
-        logs: Sequence[LogRows],
-        numbers: Sequence[int],
-        inside: Sequence[BoolArray] | None = None,
+        self, healthy: Healthy, logs: Sequence[LogRows], inside: Sequence[BoolArray]
     ) -> None:
-        self._healthy, self._numbers = healthy, list(numbers)
-        self._blocks = [
-            _Block(healthy, logs[k], None if inside is None else inside[k]) for k in self._numbers
-        ]
-        known = healthy.known.table
-        self._right = known[:, :-1].T @ known[:, -1]
-        precision = known[:, :-1].T @ known[:, :-1]
-        precision = precision + sum(block.precision for block in self._blocks)
+        self._healthy, self._logs, self._inside = healthy, logs, inside
+        self._numbers = [k for k, rows in enumerate(inside) if rows.any()]
+        n, known = healthy.n, healthy.known.table
+        size = n + sum(logs[k].m for k in self._numbers)
+        precision = np.eye(size)
+        precision[:n, :n] = known[:, :-1].T @ known[:, :-1]
+        self._right = np.zeros((size, 2))
+        self._right[:n, 1] = known[:, :-1].T @ known[:, -1]
+        self._X, self._at, first = {}, {}, n
+        for k in self._numbers:
+            m = logs[k].m
+            X = logs[k].columns[inside[k], : m + n] / np.sqrt(healthy.s2)
+            at = np.r_[first : first + m, :n]
+            precision[np.ix_(at, at)] += X.T @ X
+            self._X[k], self._at[k], first = X, at, first + m
         self._root = np.linalg.cholesky(precision)
 
-    def about(self, evidence: EffectEvidence, size: float) -> _About:
-        """Return the likelihood about a size [bounds]."""
-        products, right = np.zeros((2, 2)), np.zeros((self._right.size, 2))
-        residuals = []
-        right[:, 1] = self._right
-        for number, block in zip(self._numbers, self._blocks, strict=True):
-            shape = shape_in_log(evidence, number, block.log)
-            vectors, row = _residuals(self._healthy, block.log, shape, size)
-            own, delta = block.products(vectors)
-            products += own + np.outer(row, row)
-            right += delta
-            residuals.append(vectors[:, 1])
+    def about(self, evidence: Evidence, size: float) -> tuple[float, float, float, float]:
+        """Return χ² about a size [bounds], its gradient and curvature, and the error left [V²]."""
+        products, right, volts = np.zeros((2, 2)), self._right.copy(), {}
+        for k in self._numbers:
+            log, rows = self._logs[k], self._inside[k]
+            vectors, row = self._residuals(evidence.shape_in(k, log), log, size)
+            weight = np.sqrt(log.trace.weights[log.kept][rows] / self._healthy.s2)
+            v = vectors[rows] * weight[:, None]
+            products += v.T @ v + np.outer(row, row)
+            right[self._at[k]] += self._X[k].T @ v
+            volts[k] = v[:, 1]
         half = np.linalg.solve(self._root, right)
         left = products - half.T @ half
-        return _About(
-            float(left[1, 1]),
-            float(left[0, 1]),
-            max(float(left[0, 0]), 1e-9),
-            np.linalg.solve(self._root.T, half[:, 1]),
-            residuals,
-        )
+        n = self._healthy.n
+        delta = np.linalg.solve(self._root.T, half[:, 1])[:n]
+        square = sum(float(np.sum((v - self._X[k][:, -n:] @ delta) ** 2)) for k, v in volts.items())
+        left_v2 = square * self._healthy.s2 / total_s([self._logs[k] for k in self._numbers])
+        return float(left[1, 1]), float(left[0, 1]), max(float(left[0, 0]), 1e-9), left_v2
 
-    def left_v2(self, at: _About) -> float:
-        """Return the mean square error that remains about a size [V²]."""
-        blocks = zip(self._blocks, at.residuals, strict=True)
-        square = sum(block.square(residual_v, at.delta) for block, residual_v in blocks)
-        seconds = sum(block.log.seconds for block in self._blocks)
-        return square * self._healthy.s2 / seconds
+    def _residuals(
+        self, shape: Shape | None, log: LogRows, size: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return slope and residual about a size on the rows kept, and the same of the own SoC.
 
-    def newton(self, evidence: EffectEvidence, size: float) -> float:
+        The slope is per bound, with the sign of a column.
+        """
+        plain = log.of.plain
+        if shape is None:
+            residual_v = plain.residual_v[log.kept]
+            row, _ = self._healthy.own_soc(log, plain.soc_pct)
+            return np.column_stack([np.zeros_like(residual_v), residual_v]), np.array([0.0, row])
+        step = abs(shape.about) / shape.bound
+        low, high = shape.low / shape.bound, shape.high / shape.bound
+        beyond = size + step if size + step <= high else size - step
+        beyond = min(max(beyond, low), high)
+        found = [
+            log.of.with_effect(shape.effect, shape.values(each * shape.bound)) if each else plain
+            for each in (size, beyond)
+        ]
+        here, there = (each.residual_v[log.kept] for each in found)
+        rows = [self._healthy.own_soc(log, each.soc_pct)[0] for each in found]
+        change = beyond - size
+        slope = np.column_stack([(here - there) / change, here])
+        return slope, np.array([(rows[0] - rows[1]) / change, rows[0]])
+
+    def newton(self, evidence: Evidence, size: float) -> float:
         """Return the size after one step from a size found with all rows [bounds]."""
-        there = self.about(evidence, size)
-        change = (there.gradient - RIDGE * size) / (there.curvature + RIDGE)
-        low, high = evidence.bounds
-        return float(np.clip(size + change, low, high))
+        _, gradient, curvature, _ = self.about(evidence, size)
+        change = (gradient - RIDGE * size) / (curvature + RIDGE)
+        return float(np.clip(size + change, *evidence.bounds))
 
-    def largest(self, evidence: EffectEvidence, starts: Sequence[float]) -> tuple[float, _About]:
-        """Return the most probable size [bounds], from the best of several starts."""
-        low, high = evidence.bounds
+    def largest(self, evidence: Evidence, starts: Sequence[float]) -> Evidence:
+        """Return the evidence at the most probable size, from the best of several starts [bounds].
+
+        A size of zero has no evidence.
+        """
         size, here = 0.0, self.about(evidence, 0.0)
+        without, over = here[0], self._healthy.excess_of(evidence.shape.effect.id)
         tried = {start: self.about(evidence, start) for start in starts if abs(start) >= MIN_STEP}
-        step = min(tried, key=lambda start: tried[start].chi2, default=0.0)
+        step = min(tried, key=tried.__getitem__, default=0.0)
         for _ in range(STEPS):
             if abs(step) < MIN_STEP:
                 break
             there = tried.get(size + step) or self.about(evidence, size + step)
-            if there.chi2 >= here.chi2:
+            if there[0] >= here[0]:
                 step *= SHRINK
                 continue
             size, here = size + step, there
-            change = (here.gradient - RIDGE * size) / (here.curvature + RIDGE)
-            step = float(np.clip(size + change, low, high)) - size
+            change = (here[1] - RIDGE * size) / (here[2] + RIDGE)
+            step = float(np.clip(size + change, *evidence.bounds)) - size
             if abs(step) < MIN_CHANGE * abs(size):
                 break
-        return size, here
+        chi2, _, curvature, left_v2 = here
+        bound = evidence.shape.bound
+        return replace(
+            evidence,
+            size=size * bound,
+            std=float(np.sqrt(over / (curvature + RIDGE))) * bound,
+            nats=0.5 * (without - chi2) / over,
+            left_v2=left_v2,
+        )
 
 
-def _residuals(
-    healthy: Healthy, log: LogRows, shape: Shape | None, size: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return slope and residual about a size on the rows that count, and the same of its SoC row.
-
-    The slope is per bound, with the sign of a column.
-    """
-    plain = log.of.plain
-    if shape is None:
-        residual_v = plain.residual_v[log.kept]
-        row = soc_row(healthy, log, plain.soc_pct)
-        return np.column_stack([np.zeros_like(residual_v), residual_v]), np.array([0.0, row])
-    step = abs(shape.about) / shape.bound
-    low, high = shape.low / shape.bound, shape.high / shape.bound
-    beyond = size + step if size + step <= high else size - step
-    beyond = min(max(beyond, low), high)
-    found = [
-        log.of.with_effect(shape.effect, shape.values(each * shape.bound)) if each else plain
-        for each in (size, beyond)
-    ]
-    here, there = (each.residual_v[log.kept] for each in found)
-    rows = [soc_row(healthy, log, each.soc_pct) for each in found]
-    change = beyond - size
-    slope = np.column_stack([(here - there) / change, here])
-    return slope, np.array([(rows[0] - rows[1]) / change, rows[0]])
-
-
-def simulated(healthy: Healthy, logs: Sequence[LogRows], evidence: Evidence) -> Evidence:
+def simulated(
+    healthy: Healthy, logs: Sequence[LogRows], evidence: dict[str, Evidence]
+) -> dict[str, Evidence]:
     """Return the evidence with effects on signals and count simulated at their sizes."""
-    best = max(e.nats * healthy.excess_of(name) for name, e in evidence.effects.items())
-    profile, found = None, dict(evidence.effects)
-    for name, e in evidence.effects.items():
-        over = healthy.excess_of(name)
-        effect = e.shape.effect
-        likely = e.nats * over > SIMULATED_PART * best
-        if effect.adds_voltage or not (likely or effect.fault in MOVE_SOC):
+    nats = {name: e.nats * healthy.excess_of(name) for name, e in evidence.items()}
+    profile, found = SizeProfile(healthy, logs, _every(logs)), dict(evidence)
+    for name, e in evidence.items():
+        is_likely = nats[name] > SIMULATED_PART * max(nats.values())
+        if e.shape.effect.adds_voltage or not (is_likely or e.fault in MOVE_SOC):
             continue
-        if profile is None:
-            profile = SizeProfile(healthy, logs, range(len(logs)))
-        found[name] = _simulated(profile, e, over)
-    return replace(evidence, effects=found)
+        bound = e.shape.bound
+        starts = [e.size / bound]
+        if e.fault == "start":
+            starts += [part * end for end in e.bounds for part in START_PARTS]
+        if e.shape.effect.moves_time and not e.shape.is_tangent:
+            starts.append(e.shape.about / bound)
+        found[name] = profile.largest(e, starts)
+    return found
 
 
-def _simulated(profile: SizeProfile, evidence: EffectEvidence, over: float) -> EffectEvidence:
-    bound = evidence.shape.bound
-    low, high = evidence.bounds
-    starts = [evidence.size / bound]
-    if evidence.shape.effect.fault == "start":
-        starts += [part * end for end in (low, high) for part in START_PARTS]
-    if evidence.shape.effect.moves_time and not evidence.shape.is_tangent:
-        starts.append(evidence.shape.about / bound)
-    without = profile.about(evidence, 0.0).chi2
-    size, at = profile.largest(evidence, starts)
-    nats = 0.5 * (without - at.chi2)
-    return replace(
-        evidence,
-        size=size * bound,
-        std=float(np.sqrt(over / (at.curvature + RIDGE))) * bound,
-        nats=nats / over,
-        left_v2=profile.left_v2(at),
-    )
+def _every(logs: Sequence[LogRows]) -> list[BoolArray]:
+    return [np.ones(log.kept.size, dtype=bool) for log in logs]
 
 
-class HeldOut:
-    """Sizes of effects for the rows of some logs, found without these rows.
+def held_out(
+    healthy: Healthy, logs: Sequence[LogRows]
+) -> list[tuple[SizeProfile, list[BoolArray]]]:
+    """Return the rows that are judged together, with the profile of sizes without them.
 
-    Without their log where there are two or more, else without their set of blocks.
+    One log of several in turn; of a single log, one set of blocks.
     """
-
-    def __init__(self, healthy: Healthy, logs: Sequence[LogRows]) -> None:
-        self._logs = logs
-        numbers = range(len(logs))
-        if len(logs) > 1:
-            self._parts = [np.full(log.kept.size, k) for k, log in enumerate(logs)]
-            self._without = [
-                SizeProfile(healthy, logs, [k for k in numbers if k != left]) for left in numbers
-            ]
-            return
+    every = _every(logs)
+    if len(logs) > 1:
+        judged = [[rows & (k == j) for k, rows in enumerate(every)] for j in range(len(logs))]
+    else:
         (log,) = logs
         time_s = log.trace.log.time_s[log.trace.rows][log.kept]
         fold = ((time_s - time_s[0]) // BLOCK_S).astype(np.intp) % FOLDS
-        self._parts = [fold]
-        self._without = [SizeProfile(healthy, logs, [0], [fold != k]) for k in range(FOLDS)]
-
-    def sizes(self, evidence: EffectEvidence) -> list[FloatArray]:
-        """Return the size of an effect for each row that counts of each log."""
-        bound = evidence.shape.bound
-        size = evidence.size / bound
-        found = np.array([part.newton(evidence, size) for part in self._without]) * bound
-        return [found[part] for part in self._parts]
+        judged = [[fold == k] for k in range(FOLDS)]
+    return [(SizeProfile(healthy, logs, [~rows for rows in part]), part) for part in judged]

@@ -51,8 +51,7 @@ def answer(found: Diagnosis) -> str:
         if found.simulator.remark:  # it says itself what to do
             lines = [found.simulator.remark, *(lines if found.posterior.stated else lines[:2])]
         if found.correction is not None:
-            effect = found.correction.evidence.shape.effect
-            lines.append(correction(effect.id, found.parameters(effect.fault)))
+            lines.append(correction(found.correction.evidence))
     check = found.model_check
     if check is not None and not check.describes:
         lines = [*_model_lines(found, check), f"These logs: {_lower(lines[0])}", *lines[1:]]
@@ -62,7 +61,8 @@ def answer(found: Diagnosis) -> str:
 def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     among = f"{volts(check.among_themselves_rmse_v)} among themselves"
     size = f"{volts(check.references_rmse_v)} ({among})"
-    missed = [_lower(text) for text in found.missed_sentences]
+    given = found.model.extended_model()
+    missed = [_lower(found.sentence(each.evidence, given)) for each in check.missed]
     what = "none of the nine faults explains it"
     if missed:
         what = f"to it they look as if {'; '.join(missed)}"
@@ -93,7 +93,7 @@ def _what(found: Diagnosis) -> str:
     if not posterior.stated:
         unknown = percent(posterior.unknown)
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
-    texts = [found.sentence(fault) for fault in posterior.stated]
+    texts = [found.sentence(found.best_of(fault)) for fault in posterior.stated]
     what = ", or ".join([texts[0], *map(_lower, texts[1:])]) + "."
     return f"{what} Likelihood: {_likeliest(found)}.{sure}"
 
@@ -221,7 +221,7 @@ def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:
 
 def _amount(found: Diagnosis, fault: str) -> str:
     """Return the amplitude of a fault's best shape with its interval."""
-    of = next(item for item in found.parameters(fault).values() if item.ci is not None)
+    of = next(item for item in found.best_of(fault).parameters.values() if item.ci is not None)
     low, high = of.ci or (of.value, of.value)
     ends = f"{significant(low, 2)} … {significant(high, 2)}"
     return f"{significant(of.value, 2, shown_unit(of.unit))} ({ends})"
@@ -229,12 +229,12 @@ def _amount(found: Diagnosis, fault: str) -> str:
 
 def plan_text(found: Diagnosis) -> str:
     """Return what the next measurement is expected to bring, in a sentence."""
-    step = found.next_step
-    if step is None:
+    if found.next_step is None:
         return "Next step: none; there is no fault to settle."
+    fault, before, after = found.next_step
     return (
-        f"Next step: {step.measurement}. The probability of the true fault would rise from"
-        f" {percent(step.before)} to {percent(step.after)}."
+        f"Next step: {FAULT[fault].measurement}. The probability of the true fault would rise from"
+        f" {percent(before)} to {percent(after)}."
     )
 
 

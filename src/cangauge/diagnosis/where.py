@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._text import number
-from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge._typing import FloatArray, IntArray
 
 REST_C_RATE: Final = 0.02
 """Current below which the pack rests [1/h]."""
@@ -115,7 +115,7 @@ def excesses(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, An
     found = []
     for axis, unit, values, edges in _axes(logs, capacity_ah):
         for low, high in itertools.pairwise(edges.tolist()):
-            inside = _inside(values, low, high, last=high >= edges[-1])
+            inside = (values >= low) & ((values < high) | (high >= edges[-1]))
             if np.unique(piece[inside]).size < LEAST_PIECES:
                 continue
             part, rows, whole, all_rows = drawn_sums(
@@ -142,42 +142,31 @@ def clause(where: Sequence[dict[str, Any]]) -> str:
     worst = [place for place in where if place["excess"] >= DIFFERENT and place["ci"][0] > 1.0]
     if not worst:
         return "everywhere alike"
-    place = max(worst, key=lambda place: place["ci"][0])
-    low, high = place["range"]
+    lowest = [place["ci"][0] for place in worst]
+    place = worst[lowest.index(max(lowest))]
+    ranges = [each["range"] for each in where if each["axis"] == place["axis"]]
+    first, last = min(low for low, _ in ranges), max(high for _, high in ranges)
     times = number(place["excess"], 1)
-    return f"{_place(place['axis'], low, high, where)} ({times} times that of all rows)"
+    return f"{_place(place, first, last)} ({times} times that of all rows)"
 
 
-def _place(axis: str, low: float, high: float, where: Sequence[dict[str, Any]]) -> str:
-    of_axis = [place["range"] for place in where if place["axis"] == axis]
-    first, last = min(each[0] for each in of_axis), max(each[1] for each in of_axis)
-    if axis == "soc":
-        return _between(low, high, first, last, "% SoC")
-    if axis == "temperature":
-        return _between(low, high, first, last, "°C")
+def _place(place: dict[str, Any], first: float, last: float) -> str:
+    """Return an interval of an axis from `first` to `last`, as a reader would say it."""
+    axis, (low, high) = place["axis"], place["range"]
+    if axis in ("soc", "temperature"):
+        unit = "% SoC" if axis == "soc" else "°C"
+        if low == first:
+            return f"below {high:.0f} {unit}"
+        return f"above {low:.0f} {unit}" if high == last else f"at {low:.0f} to {high:.0f} {unit}"
     if axis == "current":
         if high <= 0.0:
             return f"while charging at {-high:.0f} to {-low:.0f} A"
-        return (
-            f"at rest ({low:.0f} to {high:.0f} A)" if low < 0.0 else f"at {low:.0f} to {high:.0f} A"
-        )
+        span = f"{low:.0f} to {high:.0f} A"
+        return f"at rest ({span})" if low < 0.0 else f"at {span}"
     if axis == "rest":
-        return (
-            f"in the first {high:.0f} min after a rest"
-            if low == 0.0
-            else f"{low:.0f} min after a rest"
-        )
+        start = f"in the first {high:.0f}" if low == 0.0 else f"{low:.0f}"
+        return f"{start} min after a rest"
     return f"in minutes {low / 60.0:.0f} to {high / 60.0:.0f}"
-
-
-def _between(low: float, high: float, first: float, last: float, unit: str) -> str:
-    if low == first:
-        return f"below {high:.0f} {unit}"
-    return f"above {low:.0f} {unit}" if high == last else f"at {low:.0f} to {high:.0f} {unit}"
-
-
-def _inside(values: FloatArray, low: float, high: float, *, last: bool) -> BoolArray:
-    return np.asarray((values >= low) & ((values < high) | last))
 
 
 def _axes(

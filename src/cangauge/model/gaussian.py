@@ -53,10 +53,6 @@ class GaussianPosterior:
         """Return the covariance, shape (p, p)."""
         return np.asarray(self.root @ self.root.T)
 
-    def std_of(self, X: FloatArray) -> FloatArray:
-        """Return the standard deviation of each row of X·θ, shape (n,)."""
-        return np.asarray(np.sqrt(np.sum((X @ self.root) ** 2, axis=1)))
-
 
 @dataclass(frozen=True, eq=False)
 class Added:
