@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
 from cangauge.bus.database import MAX_DBC_BYTES, SignalCodec, load_dbc, signal_codec
-from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE
+from cangauge.bus.protection import RULES
 from cangauge.bus.publish import reason_bits
 from cangauge.errors import InputError, located
 from cangauge.types import Reason, Status
@@ -208,7 +208,7 @@ def test_leaf_frames_as_recorded() -> None:
     # On the bus, negative is discharge.
     assert (values["current_a"], values["voltage_v"]) == (-9.5, 373.0)
     assert (values["main_relay_on"], values["counter_1db"]) == (1, 1)
-    assert values["crc_1db"] == LEAF_RULE.crc(bytes.fromhex("FDA0BAAA00000100")) == 0xA8
+    assert values["crc_1db"] == RULES["leaf"].crc(bytes.fromhex("FDA0BAAA00000100")) == 0xA8
     soc = leaf.decode_message("BATTERY_55B", bytes.fromhex("D8800000E7001123"))["soc_pct"]
     assert soc == pytest.approx(86.6, abs=1e-9)
 
@@ -233,7 +233,7 @@ def test_published_frames_agree_with_the_estimator() -> None:
 
 def test_counter_and_crc_are_where_the_rule_has_them() -> None:
     for message in LOADED["generic_pack.dbc"].messages:
-        data = GENERIC_RULE.protect(bytes(message.length), 11)
+        data = RULES["generic"].protect(bytes(message.length), 11)
         values = message.decode(data, decode_choices=False)
         found = {key.partition("_")[0]: value for key, value in values.items()}
         assert (found["counter"], found["crc"]) == (11, data[-1])

@@ -14,10 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
+from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.decoder import Pairing, SampleDecoder
 from cangauge.bus.open import bus_address
-from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import EXTENDED, Vehicle, pgn_mask
+from cangauge.bus.protection import RULES
+from cangauge.bus.vehicle import Vehicle, pgn_mask
 from cangauge.errors import InputError
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
@@ -48,7 +49,7 @@ def frame(number: int, data: bytes, time_s: float = 1.0, *, wide: bool = False) 
 
 
 def leaf_frame(hex_data: str, time_s: float, counter: int) -> can.Message:
-    return frame(0x1DB, LEAF_RULE.protect(bytes.fromhex(hex_data), counter), time_s)
+    return frame(0x1DB, RULES["leaf"].protect(bytes.fromhex(hex_data), counter), time_s)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cangauge.bus.plausibility import SignalChecks
-from cangauge.bus.protection import LEAF_RULE, ProtectionRule
+from cangauge.bus.protection import RULES, ProtectionRule
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
 
@@ -81,7 +81,7 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
 def test_presets_are_known_in_any_spelling() -> None:
     leaf = Vehicle.load("Leaf-ZE0")
     assert (leaf.name, leaf.temperature_source) == ("Nissan Leaf ZE0", "pack")
-    assert leaf.messages[0x1DB][:2] == (LEAF_RULE, 0.01)
+    assert leaf.messages[0x1DB][:2] == (RULES["leaf"], 0.01)
     assert (PRESETS["leaf_ze0"].periods_s, PRESETS["leaf_ze1"].periods_s) == (
         {0x5BC: 0.5}, {0x5BC: 0.1},
     )  # fmt: skip

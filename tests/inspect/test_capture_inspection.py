@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.protection import RULES
 from cangauge.bus.vehicle import Vehicle
 from cangauge.inspect.capture import inspect_capture
 from cangauge.replay.encoder import FrameEncoder
@@ -94,7 +94,7 @@ def test_inspection_of_unknown_frames(tmp_path: Path) -> None:
         )
         for n in range(300)
     ]
-    constant = LEAF_RULE.protect(bytes(8), 0)  # a CRC that is right by chance
+    constant = RULES["leaf"].protect(bytes(8), 0)  # a CRC that is right by chance
     frames += [
         can.Message(
             timestamp=30.0 + n,

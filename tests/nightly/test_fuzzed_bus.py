@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cangauge.bus.protection import GENERIC_RULE
+from cangauge.bus.protection import RULES
 from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.time_source import StampLimiter, clock_frame
 from cangauge.bus.vehicle import Vehicle
@@ -106,7 +106,7 @@ def check_readable(rng: Random, reader: SocReader, message: can.Message) -> None
     assert reader.read(message) is not None
     data = bytearray(message.data)
     data[rng.randrange(6)] ^= 1 << rng.randrange(8)
-    message.data = bytearray(GENERIC_RULE.protect(data, rng.randrange(16)))
+    message.data = bytearray(RULES["generic"].protect(data, rng.randrange(16)))
     reader.read(message)
 
 

@@ -14,7 +14,7 @@ import can
 import pytest
 from simulated import estimate_in
 
-from cangauge.bus.protection import GENERIC_RULE
+from cangauge.bus.protection import RULES
 from cangauge.bus.publish import SocReader
 from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.estimation.offline import samples_of
@@ -42,7 +42,7 @@ def recorded(seconds: float = 60.0) -> list[can.Message]:
         frames += FrameEncoder(VEHICLE).encode(sample)  # a new encoder: slow signals are always due
     made = Counter[int]()
     for frame in frames:
-        frame.data = bytearray(GENERIC_RULE.protect(frame.data, made[frame.arbitration_id]))
+        frame.data = bytearray(RULES["generic"].protect(frame.data, made[frame.arbitration_id]))
         made[frame.arbitration_id] += 1
     return frames
 
@@ -54,9 +54,9 @@ def with_value(value: float) -> Fault:
     """Return a fault that puts a value into a frame and keeps its protection valid."""
 
     def fault(frame: can.Message) -> None:
-        counter = GENERIC_RULE.counter(frame.data)
+        counter = RULES["generic"].counter(frame.data)
         SIGNALS[frame.arbitration_id].codec.encode_into(frame.data, value)
-        frame.data = bytearray(GENERIC_RULE.protect(frame.data, counter))
+        frame.data = bytearray(RULES["generic"].protect(frame.data, counter))
 
     return fault
 
@@ -66,7 +66,7 @@ def flip(frame: can.Message) -> None:
 
 
 def repeat_counter(frame: can.Message) -> None:
-    frame.data = bytearray(GENERIC_RULE.protect(frame.data, 7))
+    frame.data = bytearray(RULES["generic"].protect(frame.data, 7))
 
 
 def cut(frame: can.Message) -> None:

@@ -10,7 +10,6 @@ import errno
 import os
 import select
 import socket
-import struct
 import sys
 import time
 from collections import Counter, deque
@@ -35,7 +34,7 @@ _POSTED_RETRY_S: Final = 0.005
 """Interval at which posted frames are retried while the transmit queue is full [s]."""
 _QUEUE_FULL: Final = {errno.ENOBUFS, errno.EAGAIN}
 
-_CLASSES: Final = {
+_ERRORS: Final = {
     0x001: "transmit_timeout",
     0x002: "arbitration_lost",
     0x008: "protocol",
@@ -44,17 +43,15 @@ _CLASSES: Final = {
     0x040: "bus_off",
     0x080: "bus_error",
     0x100: "restarted",
+    0x1_0000: "controller_receive_overflow",
+    0x2_0000: "controller_transmit_overflow",
+    0x4_0000: "receive_warning",
+    0x8_0000: "transmit_warning",
+    0x10_0000: "receive_passive",
+    0x20_0000: "transmit_passive",
+    0x40_0000: "error_active",
 }
-_CONTROLLER: Final = 0x004
-_CONTROLLER_STATES: Final = {
-    0x01: "controller_receive_overflow",
-    0x02: "controller_transmit_overflow",
-    0x04: "receive_warning",
-    0x08: "transmit_warning",
-    0x10: "receive_passive",
-    0x20: "transmit_passive",
-    0x40: "error_active",
-}
+"""Error classes, and above them states of the controller (linux/can/error.h)."""
 
 
 class BusError(CangaugeError):
@@ -62,22 +59,17 @@ class BusError(CangaugeError):
 
 
 def error_kinds(message: can.Message) -> list[str]:
-    """Return the error classes of a SocketCAN error frame (linux/can/error.h), at least one.
+    """Return the error classes of a SocketCAN error frame, at least one.
 
-    The classes are bits of the id; the controller's state is in byte 1.
+    The classes are bits of the id; with 0x004, the controller's state is in byte 1.
     """
-    classes = message.arbitration_id
-    kinds = [name for bit, name in _CLASSES.items() if classes & bit]
-    if classes & _CONTROLLER:
-        state = message.data[1] if len(message.data) > 1 else 0
-        states = [name for bit, name in _CONTROLLER_STATES.items() if state & bit]
-        kinds += states or ["controller"]
+    classes = message.arbitration_id & 0x1FF
+    is_of_controller = bool(classes & 0x004)
+    state = message.data[1] if is_of_controller and len(message.data) > 1 else 0
+    kinds = [name for bit, name in _ERRORS.items() if (state << 16 | classes) & bit]
+    if is_of_controller and not state & 0x7F:
+        kinds.append("controller")
     return kinds or ["unspecified"]
-
-
-_SO_MEMINFO: Final = 55
-_MEMINFO: Final = struct.Struct("=9I")
-_MEMINFO_DROPS: Final = 8
 
 
 def _queue_drops(bus: can.BusABC) -> int | None:
@@ -91,8 +83,9 @@ def _queue_drops(bus: can.BusABC) -> int | None:
         return None
     with suppress(OSError, NotImplementedError, ValueError):
         with socket.socket(fileno=os.dup(bus.fileno())) as own:
-            answer = own.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
-        return int(_MEMINFO.unpack(answer)[_MEMINFO_DROPS])
+            # SO_MEMINFO: nine numbers of 32 bits, the last of which are the drops.
+            answer = own.getsockopt(socket.SOL_SOCKET, 55, 36)
+        return int.from_bytes(answer[32:], sys.byteorder)
     return None
 
 

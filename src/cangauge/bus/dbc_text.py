@@ -22,7 +22,8 @@ MOST_BYTES: Final = 4095
 _MOST_ENTRIES: Final = 1 << 17
 """Most entries in cantools' tables of multiplexed signals, of which it makes 60,000 a second: two
 signals for every value of 16 bits."""
-_EXTENDED_FLAG: Final = 1 << 31
+EXTENDED: Final = 1 << 31
+"""Flag of an extended id in a DBC and in a message key, as in SocketCAN."""
 _UNASSIGNED: Final = "VECTOR__INDEPENDENT_SIG_MSG"
 """Message of editors for signals that are in no message; cantools leaves it out."""
 
@@ -88,7 +89,7 @@ def _blank(quoted: re.Match[str]) -> str:
 def _with_flags(text: str, ids: list[re.Match[str]]) -> str:
     parts, place = [], 0
     for match in ids:
-        parts += [text[place : match.start(1)], str(int(match[1]) | _EXTENDED_FLAG)]
+        parts += [text[place : match.start(1)], str(int(match[1]) | EXTENDED)]
         place = match.end(1)
     return "".join([*parts, text[place:]])
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec
+from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
 from cangauge.bus.plausibility import (
     MessageStatistics,
@@ -22,7 +23,7 @@ from cangauge.bus.plausibility import (
     stuck_detectors,
 )
 from cangauge.bus.protection import FrameChecker, Verdict
-from cangauge.bus.vehicle import EXTENDED, CellSignals, Vehicle, VehicleSignal, pgn_mask
+from cangauge.bus.vehicle import CellSignals, Vehicle, VehicleSignal, pgn_mask
 from cangauge.types import Reason, Sample
 
 _MISSING: Final = {

@@ -15,9 +15,6 @@ LONGEST_GAP_S: Final = 1.0
 
 SINGLE, FIRST, CONSECUTIVE = range(3)
 """Kinds of frames, in the upper half of their first byte."""
-_LARGEST_START: Final = 0x3F
-"""Largest first byte of a frame: that of flow control."""
-_REPLY_OFFSET = 0x40
 READ_BY_IDENTIFIER: Final = 0x62
 """First byte of a reply to ReadDataByIdentifier (22), before two bytes of the data identifier."""
 
@@ -53,7 +50,7 @@ class Reassembler:
     def take(self, data: bytes | bytearray, time_s: float) -> bytes | None:
         """Take a frame at bus time `time_s` [s]; return the reply that it completes, if any."""
         self.frames += 1
-        if data and data[0] > _LARGEST_START:
+        if data and data[0] > 0x3F:  # the largest first byte of a frame, of flow control
             data = data[1:]
         if not data:
             return None
@@ -93,4 +90,4 @@ class PollTarget:
     @property
     def request(self) -> bytes:
         """Payload of the request."""
-        return bytes([self.reply[0] - _REPLY_OFFSET]) + self.reply[1:]
+        return bytes([self.reply[0] - 0x40]) + self.reply[1:]

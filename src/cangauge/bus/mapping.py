@@ -14,11 +14,11 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, mo
 
 from cangauge._config import read_toml
 from cangauge.bus.database import BitField
-from cangauge.bus.plausibility import SignalChecks
+from cangauge.bus.plausibility import Positive, SignalChecks
 from cangauge.bus.protection import (
-    LIST_LENGTH,
     PROFILES,
     RULES,
+    Byte,
     CounterRule,
     DataIdMode,
     E2eRule,
@@ -30,14 +30,8 @@ from cangauge.estimation.cells import CELLS_AT_MOST
 from cangauge.logs.column_map import ColumnMap
 from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource, VoltageAccuracyPct
 
-PAIR_WITHIN_S: Final = 0.020
-"""Largest distance in bus time between paired current and voltage [s] (DESIGN: configurable)."""
-
 COUNTER: Final = "counter"
 """Protection by a counter alone."""
-
-_Byte = Annotated[int, Field(ge=0, le=255)]
-_Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 
 
 class _MapTable(BaseModel):
@@ -58,7 +52,7 @@ class SignalMap(SignalChecks):
     signal: str
     sign: Literal[1, -1] = 1
     signed: bool = False
-    scale: _Positive = 1.0
+    scale: Positive = 1.0
     offset: FiniteFloat = 0.0
     when: dict[str, int] = Field(default_factory=dict)
     not_available: tuple[int, ...] = ()
@@ -103,12 +97,12 @@ class CellsMap(_MapTable):
     index: str | None = None
     signals: tuple[str, ...] = ()
     first_index: int = 0
-    scale: _Positive = 1.0
+    scale: Positive = 1.0
     offset: FiniteFloat = 0.0
     not_available: tuple[int, ...] = ()
     lowest: FiniteFloat = 0.2
     highest: FiniteFloat = 6.0  # below and above any lithium cell
-    timeout_s: _Positive = 10.0  # large packs send a round of cells in some seconds
+    timeout_s: Positive = 10.0  # large packs send a round of cells in some seconds
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -159,11 +153,9 @@ class MessageMap(_MapTable):
     isotp: bool = False
     uds: bool = False
     request_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
-    period_s: _Positive | None = None
+    period_s: Positive | None = None
     data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
-    data_id_list: (
-        Annotated[tuple[_Byte, ...], Field(min_length=LIST_LENGTH, max_length=LIST_LENGTH)] | None
-    ) = None
+    data_id_list: Annotated[tuple[Byte, ...], Field(min_length=16, max_length=16)] | None = None
     data_id_mode: DataIdMode | None = None
     header_byte: Annotated[int, Field(ge=0, le=63)] | None = None
     protected_bytes: Annotated[int, Field(ge=1, le=64)] | None = None
@@ -245,7 +237,7 @@ class VehicleMap(_MapTable):
     columns: dict[str, Any] | None = None
     cells: CellsMap | None = None
     temperature_source: TemperatureSource = "unknown"
-    pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = PAIR_WITHIN_S
+    pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = 0.020
     messages: dict[str, MessageMap] = Field(default_factory=dict)
     rules: dict[str, ProtectionRule] = Field(default_factory=dict)
 

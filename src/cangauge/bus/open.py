@@ -39,7 +39,6 @@ RECEIVE_BUFFER_BYTES: Final = 16 << 20
 """Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
 CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
-_SO_RCVBUFFORCE: Final = 33  # Linux; not in Python's socket module, as the two below
 _OWN_GROUP_ONLY: Final = {
     socket.AF_INET: (socket.IPPROTO_IP, 49),
     socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
@@ -222,7 +221,7 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
 
 def _widen_receive_buffer(bus: can.BusABC) -> None:
     # A duplicate of the driver's private socket; the system may refuse, or cap the size silently.
-    forced = [_SO_RCVBUFFORCE] if sys.platform == "linux" else []
+    forced = [33] if sys.platform == "linux" else []  # SO_RCVBUFFORCE
     for option in (socket.SO_RCVBUF, *forced):
         with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
             own.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
@@ -295,8 +294,6 @@ _TYPES: Final[dict[str, type]] = {
 }
 MOST_UNWANTED: Final = 1024
 """Most packets that are read for one frame: about 15 ms."""
-_MAX_CHANNEL: Final = 64
-"""Longest name of a channel in a packet [characters]: it is recorded with every frame."""
 
 
 def message_of(packet: bytes, stamp_s: float) -> can.Message:
@@ -316,9 +313,9 @@ def message_of(packet: bytes, stamp_s: float) -> can.Message:
 
 
 def _is_channel(value: object) -> bool:
-    """Return whether a value is a channel that a line of a recording can hold as one word."""
+    """Return whether a value is a channel that a line of a recording holds as one short word."""
     if isinstance(value, str):
-        return 0 < len(value) <= _MAX_CHANNEL and value.isprintable() and " " not in value
+        return 0 < len(value) <= 64 and value.isprintable() and " " not in value
     return value is None or type(value) is int
 
 

@@ -27,15 +27,21 @@ from cangauge.types import (
     Reason,
 )
 
-INVALID_AFTER: Final = 5
-VALID_AFTER: Final = 3
-"""Consecutive values of the debouncing: short beside a time-out, longer than a disturbed frame."""
 STUCK_AFTER_S: Final = 10.0
 """Least time of a constant value [s]: a pack at rest between two pulses is constant for less."""
-TEMPERATURE_JUMP_K: Final = 5.0
-TEMPERATURE_RATE_K_PER_S: Final = 1.0
-"""Above coarse quantization and alternating sensors, and above what a pack's heat capacity allows.
-Current and voltage have no default rate limit: contactors, fuses, short circuits."""
+_LIMITS: Final[dict[str, dict[str, float]]] = {
+    "soc_reference": {"lowest": SOC_WITHIN_PCT[0], "highest": SOC_WITHIN_PCT[1]},
+    "current": {"lowest": -CURRENT_AT_MOST_A, "highest": CURRENT_AT_MOST_A},
+    "temperature": {
+        "lowest": TEMPERATURE_WITHIN_C[0],
+        "highest": TEMPERATURE_WITHIN_C[1],
+        "max_jump": 5.0,
+        "max_rate_per_s": 1.0,
+    },
+}
+"""Limits of every pack. Those of a change of temperature [K, K/s] are above coarse quantization and
+alternating sensors, and above what a pack's heat capacity allows. Current and voltage have none:
+contactors, fuses, short circuits."""
 USUAL_TIMEOUT_S: Final = (10.0, 2.0)
 """Time-out while the period is not known [s]: of signals sent on change, and of cyclic ones."""
 MISSED_UNTIL_OLD: Final = 10.0
@@ -45,8 +51,6 @@ TIMEOUT_AT_LEAST_S: Final = 0.5
 LEARN_FROM: Final = 8
 """Frame intervals from which a period counts as learned, by a mean over about 16 of them; longer
 intervals than four periods enter as four: a pause is not a period."""
-
-
 FASTER: Final = 5.0
 """Stated period / learned one from which the stated one is wrong: 10 ms that stand as 10 s."""
 
@@ -65,7 +69,7 @@ class PackProperties:
     usual_v: float
 
 
-_Positive = Annotated[FiniteFloat, Field(gt=0.0)]
+Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 _Count = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -73,20 +77,22 @@ class SignalChecks(BaseModel):
     """Plausibility limits of a signal [A, positive = discharge; V; °C; %].
 
     A value may differ from the latest good one by `max_jump`, plus `max_rate_per_s` for every
-    second since then. `stuck_after_s` is the least duration of a constant value that can count as
-    stuck [s]: current and voltage while the other one moves; others only where it is stated.
+    second since then. `invalid_after` and `valid_after` are consecutive values: few beside a
+    time-out, more than a disturbed frame. `stuck_after_s` is the least duration of a constant value
+    that can count as stuck [s]: current and voltage while the other one moves; others only where it
+    is stated.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     lowest: FiniteFloat = -math.inf
     highest: FiniteFloat = math.inf
-    max_jump: _Positive = math.inf
-    max_rate_per_s: _Positive = 0.0
-    invalid_after: _Count = INVALID_AFTER
-    valid_after: _Count = VALID_AFTER
-    stuck_after_s: _Positive | None = None
-    timeout_s: _Positive | None = None
+    max_jump: Positive = math.inf
+    max_rate_per_s: Positive = 0.0
+    invalid_after: _Count = 5
+    valid_after: _Count = 3
+    stuck_after_s: Positive | None = None
+    timeout_s: Positive | None = None
 
     @model_validator(mode="after")
     def _a_range(self) -> Self:
@@ -101,25 +107,12 @@ class SignalChecks(BaseModel):
 
         Without a pack only a SoC has some.
         """
-        limits: dict[str, float] = {}
-        if role == "soc_reference":
-            low, high = SOC_WITHIN_PCT
-            limits = {"lowest": low, "highest": high}
-        elif pack is None:
+        if role != "soc_reference" and pack is None:
             return self
-        elif role == "current":
-            limits = {"lowest": -CURRENT_AT_MOST_A, "highest": CURRENT_AT_MOST_A}
-        elif role == "voltage":
+        limits = _LIMITS.get(role, {})
+        if role == "voltage" and pack is not None:
             low, high = VOLTAGE_WITHIN
             limits = {"lowest": low * pack.usual_v, "highest": high * pack.usual_v}
-        elif role == "temperature":
-            low, high = TEMPERATURE_WITHIN_C
-            limits = {
-                "lowest": low,
-                "highest": high,
-                "max_jump": TEMPERATURE_JUMP_K,
-                "max_rate_per_s": TEMPERATURE_RATE_K_PER_S,
-            }
         return self.model_copy(update={**limits, **self.model_dump(exclude_unset=True)})
 
 
@@ -298,10 +291,9 @@ class SignalHealth:
 SWINGS: Final = 4
 FRAMES: Final = 10
 """Turning points that the partner, and equal values that a stuck signal must show."""
-STEPS: Final = 8.0
-ERRORS: Final = 8.0
+LEAST_SWING: Final = 8.0
 SWING_C_RATE: Final = 0.1
-"""Least swing of the partner, as an effect on the constant signal [quantization steps of it]; of
+"""Least swing of the partner, as an effect on the constant signal [quantization steps of it] and of
 the voltage [standard deviations of its fast error]; of the current [1/h]: 5 A at 50 Ah, above a
 pack at rest with its consumers."""
 COARSE_STEP: Final = 0.0025
@@ -377,10 +369,10 @@ def stuck_detectors(
     ohm, least_a = pack.resistance_ohm, SWING_C_RATE * pack.capacity_ah
 
     def swing_a(step_v: float) -> float:
-        return max(STEPS * step_v / ohm, least_a) if 0.0 < ohm < math.inf else math.inf
+        return max(LEAST_SWING * step_v / ohm, least_a) if 0.0 < ohm < math.inf else math.inf
 
     def swing_v(step_a: float) -> float:
-        least_v = max(max(STEPS * step_a, least_a) * ohm, ERRORS * pack.error_std_v)
+        least_v = max(LEAST_SWING * max(step_a * ohm, pack.error_std_v), least_a * ohm)
         return least_v if least_v > 0.0 else math.inf
 
     of_current = StuckDetector(after_a_s or STUCK_AFTER_S, step_a, swing_v)

@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from cangauge.bus.database import BitField
 from cangauge.errors import InputError
 
-_Byte = Annotated[int, Field(ge=0, le=255)]
+Byte = Annotated[int, Field(ge=0, le=255)]
 _Place = Annotated[int, Field(ge=-64, le=63)]
 
 
@@ -34,9 +34,9 @@ class ProtectionRule:
     bits can hold; AUTOSAR's counters of four bits often leave 15 out.
     """
 
-    polynomial: _Byte
-    initial: _Byte = 0
-    xor_out: _Byte = 0
+    polynomial: Byte
+    initial: Byte = 0
+    xor_out: Byte = 0
     crc_byte: _Place = -1
     counter_bits: Annotated[int, Field(ge=0, le=8)] = 4
     counter_byte: _Place = -2
@@ -96,19 +96,15 @@ class ProtectionRule:
         return bytes(out)
 
 
-LEAF_RULE: Final = ProtectionRule(polynomial=0x85, counter_bits=2)
-"""Nissan Leaf EV-CAN: 0x1DB, 0x1DC, 0x55B."""
-
-GENERIC_RULE: Final = ProtectionRule(
-    polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=4, counter_shift=4
-)
-"""CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: the frames that
-`replay` sends as the generic pack."""
-
-CRC_ONLY_RULE: Final = ProtectionRule(polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0)
-"""CRC-8 SAE J1850 in the last byte, no counter: REPLAY_CLOCK."""
-
-RULES: Final = {"leaf": LEAF_RULE, "generic": GENERIC_RULE, "crc_only": CRC_ONLY_RULE}
+RULES: Final = {
+    # Nissan Leaf EV-CAN: 0x1DB, 0x1DC, 0x55B.
+    "leaf": ProtectionRule(polynomial=0x85, counter_bits=2),
+    # CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: the frames that
+    # `replay` sends as the generic pack.
+    "generic": ProtectionRule(polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_shift=4),
+    # CRC-8 SAE J1850 in the last byte: REPLAY_CLOCK.
+    "crc_only": ProtectionRule(polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0),
+}
 """Rules that a map file can name."""
 
 
@@ -146,8 +142,6 @@ class CounterRule:
 
 
 DataIdMode = Literal["both", "alternating", "low", "nibble"]
-LIST_LENGTH: Final = 16
-"""Data ids of profile 2, one per counter value."""
 
 
 class Profile(NamedTuple):

@@ -19,7 +19,7 @@ import can
 from can.typechecking import Channel
 
 from cangauge.bus.open import Stamps
-from cangauge.bus.protection import CRC_ONLY_RULE
+from cangauge.bus.protection import RULES
 from cangauge.estimation.counting import LATEST_S
 from cangauge.settings import REPLAY_CLOCK_ID, TimeSourceName
 
@@ -212,12 +212,12 @@ def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
 def is_count(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
     """Return whether a frame is a REPLAY_COUNT: how many REPLAY_CLOCK came before it."""
     is_candidate = message.arbitration_id == clock_id - 1 and not message.is_extended_id
-    return is_candidate and len(message.data) == 5 and CRC_ONLY_RULE.is_whole(message.data)
+    return is_candidate and len(message.data) == 5 and RULES["crc_only"].is_whole(message.data)
 
 
 def log_time_us(data: bytes | bytearray) -> int | None:
     """Return the time in the payload of a REPLAY_CLOCK [µs]; None for a wrong CRC or length."""
-    is_whole = len(data) == 8 and CRC_ONLY_RULE.is_whole(data)
+    is_whole = len(data) == 8 and RULES["crc_only"].is_whole(data)
     return int.from_bytes(data[:-1], "little", signed=True) if is_whole else None
 
 
@@ -232,7 +232,7 @@ def count_frame(sent: int, clock_id: int = REPLAY_CLOCK_ID) -> can.Message:
 
 
 def _with_crc(frame_id: int, content: bytes) -> can.Message:
-    data = CRC_ONLY_RULE.protect(content + bytes(1), 0)
+    data = RULES["crc_only"].protect(content + bytes(1), 0)
     return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)
 
 

@@ -27,6 +27,7 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
+from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, PollTarget, reply_id, reply_start
 from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
@@ -45,9 +46,6 @@ LOG_COLUMNS: Final = {
     "cells": "voltage_v",
 }
 """Column of the canonical log by role."""
-
-EXTENDED: Final = 1 << 31
-"""Flag of an extended id in a message key (arbitration id), as in SocketCAN."""
 
 
 def pgn_mask(key: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.plausibility import (
-    ERRORS,
+    LEAST_SWING,
     STUCK_AFTER_S,
     SWING_C_RATE,
     PackProperties,
@@ -81,7 +81,7 @@ def _stuck(
     """Return the stuck intervals of current and voltage, by the detectors of the service."""
     pack = PackProperties(
         resistance_ohm,
-        error_std_v=VOLTAGE_SHARE * abs(voltage.median) / ERRORS,
+        error_std_v=VOLTAGE_SHARE * abs(voltage.median) / LEAST_SWING,
         capacity_ah=CURRENT_SHARE * (current.maximum - current.minimum) / SWING_C_RATE,
         usual_v=abs(voltage.median),
     )

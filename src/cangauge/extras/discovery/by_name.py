@@ -23,7 +23,7 @@ from cantools.database.can import Database, Message, Signal
 
 from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec, signal_codec
-from cangauge.bus.vehicle import EXTENDED
+from cangauge.bus.dbc_text import EXTENDED
 from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate
 from cangauge.extras.discovery.fields import LEAST_BITS

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from cangauge._text import printable
-from cangauge.bus.vehicle import EXTENDED, PRESETS
+from cangauge.bus.dbc_text import EXTENDED
+from cangauge.bus.vehicle import PRESETS
 from cangauge.extras.discovery.candidate import ROLES, Candidate, Level
 
 FALLBACK_C: Final = 20.0
