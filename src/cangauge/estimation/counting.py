@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 from cangauge.logs.gaps import BRIDGE_S
 
@@ -88,19 +88,6 @@ def count_std_pct(start_var_pct2: float, seconds: float, moved_pct: float) -> fl
     return math.sqrt(start_var_pct2 + offset_pct * offset_pct + capacity_pct * capacity_pct)
 
 
-class ChargeStep(NamedTuple):
-    """Contribution of one sample to the count."""
-
-    seconds: float
-    """Time since the last sample [s]."""
-    discharged_pct: float
-    """Charge taken out since the last sample [% of capacity]."""
-    away_s: float = 0.0
-    """Length of an unobserved interval [s], else 0."""
-    parked_std_pct: float = 0.0
-    """Standard deviation of its charge if the car was parked [%]."""
-
-
 @dataclass
 class CoulombCounter:
     """Charge since the first sample, in % of capacity.
@@ -131,19 +118,31 @@ class CoulombCounter:
     """Time since the first sample in which charge was counted [s]."""
     gap_var_pct2: float = 0.0
     """Variance of the charge between samples since the first [%²]."""
+    away_s: float = 0.0
+    """Length of the unobserved interval before the last sample [s]; 0 without."""
+    parked_std_pct: float = 0.0
+    """Standard deviation of its charge if the car was parked [%]."""
 
     @property
     def pct_per_as(self) -> float:
         """Change of the SoC by a charge [% per As]."""
         return 100.0 / (3600.0 * self.capacity_ah)
 
-    def step(self, time_s: float, current_a: float) -> ChargeStep:
-        """Count one sample, later than the last one [s]; positive current discharges [A]."""
+    def step(self, time_s: float, current_a: float) -> float:
+        """Count one sample, later than the last one; return the time since that [s].
+
+        Parameters
+        ----------
+        time_s : float
+        current_a : float
+            Positive discharges [A].
+        """
         last_s, last_a = self.time_s, self.current_a
         self.time_s, self.current_a = time_s, current_a
+        self.away_s = self.parked_std_pct = 0.0
         if math.isnan(last_s):
             self.mean_square_a2 = current_a * current_a
-            return ChargeStep(0.0, 0.0)
+            return 0.0
         seconds, pct_per_as = time_s - last_s, self.pct_per_as
         across_a = 0.5 * (current_a + last_a)
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
@@ -154,7 +153,8 @@ class CoulombCounter:
         # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
         if seconds > max(BRIDGE_S, self.gap_s):
             rms_a = math.sqrt(max(mean_square_a2, last_a * last_a))
-            return ChargeStep(seconds, 0.0, seconds, parked_std_pct(seconds, rms_a * pct_per_as))
+            self.away_s, self.parked_std_pct = seconds, parked_std_pct(seconds, rms_a * pct_per_as)
+            return seconds
         self.counted_s += seconds
         out_pct = across_a * seconds * pct_per_as
         self.discharged_pct += out_pct
@@ -165,7 +165,7 @@ class CoulombCounter:
             across_a2 = 0.5 * (current_a * current_a + last_a * last_a)
             gap_pct = math.sqrt(max(mean_square_a2, across_a2)) * seconds * pct_per_as
             self.gap_var_pct2 += gap_pct * gap_pct
-        return ChargeStep(seconds, out_pct)
+        return seconds
 
     def since(self, before: CoulombCounter) -> tuple[float, float, float]:
         """Return time [s], charge taken out [%] and its variance [%²] since a copy was made."""

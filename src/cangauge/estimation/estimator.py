@@ -22,10 +22,10 @@ from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
+from cangauge.estimation.checks import detect_references, drop_implausible, since, watch_sign
 from cangauge.estimation.counting import (
     UNKNOWN_INTERRUPTION_S,
     UNKNOWN_STD_PCT,
-    ChargeStep,
     CoulombCounter,
     EstimatorClock,
     count_std_pct,
@@ -35,10 +35,9 @@ from cangauge.estimation.counting import (
 from cangauge.estimation.ekf import inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
-from cangauge.estimation.settings import EstimatorSettings, detect_references, since
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
-from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
 from cangauge.model.prior import SLOW_S
@@ -46,8 +45,6 @@ from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import (
     CURRENT_AT_MOST_A,
     REASONS,
-    TEMPERATURE_WITHIN_C,
-    VOLTAGE_WITHIN,
     Estimate,
     Health,
     Power,
@@ -72,18 +69,6 @@ estimate invalid [s]: twice the memory of the voltage's slow error."""
 
 ALARM: Final = 1e-6
 """Probability that the innovations of a pack that agrees with its model fail the test."""
-
-STEP_C_RATE: Final = 0.05
-"""Least change of the current between rows that shows its sign [1/h]: 3 A at 60 Ah."""
-
-STEPS_MEMORY: Final = 10.0
-STEPS_AT_LEAST: Final = 6.0
-"""Steps over which voltage and current are correlated, and the weight from which that counts: some
-ten steps, or a minute of a drive."""
-
-STEPS_CORRELATION: Final = 0.9
-"""Correlation from which the current has the wrong sign [-]. With the right one it is −0.5 or less
-in all recorded drives; a skew of one to five seconds between both gives up to 0.9."""
 
 
 class Estimator:
@@ -182,17 +167,17 @@ class Estimator:
         if time_s is None:
             return
         memory, stamp_s = self._memory, sample.time_s
-        sample, implausible = _drop_implausible(
+        sample, implausible = drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         if memory.samples == 0:
             memory.first_s = time_s
         memory.samples += 1
-        corrected = self.online.correct(Reading(*sample))
-        for reading in corrected:
-            self._process(Sample(*reading), implausible)
+        corrected = self.online.correct(sample)
+        for each in corrected:
+            self._process(each, implausible)
         if corrected:
-            self._latest = self._evaluate(Sample(*corrected[-1]), implausible)
+            self._latest = self._evaluate(corrected[-1], implausible)
         self._latest = self._latest._replace(time_s=stamp_s, samples=memory.samples)
 
     @property
@@ -268,30 +253,30 @@ class Estimator:
         if implausible and math.isnan(voltage_v):
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
             block.is_broken = True
-        charge = self._counter.step(time_s, self.online.counted(current_a))
-        if not math.isnan(temperature_c) or charge.away_s:
+        seconds = self._counter.step(time_s, self.online.counted(current_a))
+        if not math.isnan(temperature_c) or self._counter.away_s:
             memory.temperature_c = temperature_c
         self.online.advance(time_s, current_a, memory.temperature_c)
-        if charge.seconds > self.settings.gap_s:
-            self._note_gap(time_s, charge)
+        if seconds > self.settings.gap_s:
+            self._note_gap(time_s)
         is_rest = abs(current_a) <= REST_CURRENT_C_RATE * self.capacity_ah
         memory.rest_since_s = since(memory.rest_since_s, is_rest, time_s)
-        if charge.seconds > REST_S:
-            memory.rest_since_s = time_s - charge.seconds
+        if seconds > REST_S:
+            memory.rest_since_s = time_s - seconds
         tick = math.floor((time_s - memory.first_s) * self.model.rate_hz + 1e-6)
         if tick > memory.tick:
             memory.tick = tick
             self._use_row(sample)
 
-    def _note_gap(self, time_s: float, charge: ChargeStep) -> None:
+    def _note_gap(self, time_s: float) -> None:
         """Follow a gap in the current that ends now, or an unobserved interval."""
-        memory, away_s = self._memory, charge.away_s
+        memory, away_s = self._memory, self._counter.away_s
         self._block.is_broken = True
         memory.row_v = math.nan
         memory.gap_until_s = time_s + self.online.delay_line.longest_s
         if away_s > 0.0:
             self._predict_to_now()
-            self._be_away(away_s, charge.parked_std_pct)
+            self._be_away(away_s, self._counter.parked_std_pct)
 
     def _be_away(self, away_s: float, parked_pct: float) -> None:
         """Allow for a car that was charged or driven in an unobserved interval [s, %]."""
@@ -325,7 +310,7 @@ class Estimator:
                     online.drives,
                 )
             )
-            self._watch_sign(sample)
+            watch_sign(memory, sample, self.capacity_ah)
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
@@ -333,24 +318,6 @@ class Estimator:
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in detect_references(self.settings, memory, sample):
             self._correct(*reference)
-
-    def _watch_sign(self, sample: Sample) -> None:
-        """Correlate the steps of voltage and current: of a battery they are opposite."""
-        memory = self._memory
-        step_v, step_a = sample.voltage_v - memory.row_v, sample.current_a - memory.row_a
-        memory.row_v, memory.row_a = sample.voltage_v, sample.current_a
-        if math.isnan(step_v) or abs(step_a) < STEP_C_RATE * self.capacity_ah:
-            return
-        keep = 1.0 - 1.0 / STEPS_MEMORY
-        step = 1.0, step_v * step_v, step_a * step_a, step_v * step_a
-        memory.steps = tuple(
-            keep * each + new for each, new in zip(memory.steps, step, strict=True)
-        )
-        weight, v2, a2, va = memory.steps
-        if va < 0.0:
-            memory.is_sign_wrong = False
-        elif weight >= STEPS_AT_LEAST and va > STEPS_CORRELATION * math.sqrt(v2 * a2):
-            memory.is_sign_wrong = True
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
@@ -638,24 +605,6 @@ class Estimator:
         *numbers, status, reasons, samples = parts["latest"]
         self._latest = Estimate._make([*numbers, Status(status), Reason(reasons), samples])
         self.is_refused = False
-
-
-def _drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
-    """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
-
-    `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
-    """
-    reason = Reason.NONE
-    low, high = VOLTAGE_WITHIN
-    for name, least, most in (
-        ("voltage_v", low * nominal_v, high * nominal_v),
-        ("temperature_c", *TEMPERATURE_WITHIN_C),
-    ):
-        value = getattr(sample, name)
-        if value < least or value > most:  # false for NaN
-            sample = sample._replace(**{name: math.nan})
-            reason = Reason.IMPLAUSIBLE_INPUT
-    return sample, reason
 
 
 def _is_outside(value: float, within: tuple[float, float]) -> bool:

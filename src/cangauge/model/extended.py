@@ -25,7 +25,6 @@ from cangauge.model.effects.base import (
     Effect,
     Load,
     Pack,
-    Reading,
     Signals,
     Values,
 )
@@ -35,6 +34,7 @@ from cangauge.model.inverse import socs_from_ocv
 from cangauge.model.noise import Noise
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
 from cangauge.settings import GAP_S
+from cangauge.types import Sample
 
 LAG_NUMBERS = 3
 """Numbers of the state of a lag that has started."""
@@ -273,15 +273,15 @@ class OnlineModel:
         """Return the counted part of a corrected current [A]."""
         return self._counting.counted_at(current_a)
 
-    def correct(self, reading: Reading) -> Sequence[Reading]:
-        """Return the corrected readings that are ready, usually one, in order."""
+    def correct(self, sample: Sample) -> Sequence[Sample]:
+        """Return the corrected samples that are ready, usually one, in order."""
         if not self._corrects:
-            return (reading,)
-        signals = Signals(*(np.array([value]) for value in reading))
+            return (sample,)
+        signals = Signals(*(np.array([value]) for value in sample))
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
             if signals.time_s.size:
                 signals = effect.correct(signals, values, context)
-        return [Reading(*row) for row in np.stack(signals, axis=1).tolist()]
+        return [Sample(*row) for row in np.stack(signals, axis=1).tolist()]
 
     def advance(self, time_s: float, current_a: float, temperature_c: float) -> None:
         """Advance to a corrected reading (every one, in order).

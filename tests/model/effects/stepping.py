@@ -9,10 +9,11 @@ import numpy as np
 
 from cangauge.estimation.counting import CoulombCounter
 from cangauge.model.delay_line import DelayLine
-from cangauge.model.effects.base import Effect, Pack, Parameter, Reading, Signals
+from cangauge.model.effects.base import Effect, Pack, Parameter, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel, OnlineModel
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.types import Sample
 from synthetic import drive_current
 
 MODEL = leaf_2012_model()
@@ -69,7 +70,7 @@ def online_of(extended: ExtendedModel, capacity_ah: float | None = None) -> Onli
 class Stepped:
     """Results of the sample-by-sample form."""
 
-    readings: list[Reading]
+    readings: list[Sample]
     soc_pct: np.ndarray
     """Counted by the estimator's counter."""
     voltage_v: np.ndarray
@@ -89,7 +90,7 @@ def step_through(
     readings, soc, volts = [], [], []
     columns = (signals.time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
     for row in zip(*(column.tolist() for column in columns), strict=True):
-        for reading in online.correct(Reading(*row)):
+        for reading in online.correct(Sample(*row)):
             counter.step(reading.time_s, online.counted(reading.current_a))
             online.advance(reading.time_s, reading.current_a, reading.temperature_c)
             counted = start - counter.discharged_pct

@@ -20,11 +20,12 @@ from stepping import (
     within,
 )
 
-from cangauge.model.effects.base import Effect, Pack, Reading, Signals
+from cangauge.model.effects.base import Effect, Pack, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 from cangauge.model.voltage_model import PublishedCurve
+from cangauge.types import Sample
 from selection import nightly_except
 from synthetic import synthetic_log, voltage_model, within_c
 
@@ -241,7 +242,7 @@ def test_missing_signals_affect_only_themselves(effect: Effect) -> None:
         signals.time_s.tolist(), signals.current_a.tolist(), voltage.tolist(),
         temperature.tolist(), strict=True,
     ):  # fmt: skip
-        found.extend(online.correct(Reading(*row)))
+        found.extend(online.correct(Sample(*row)))
     found_rows = np.array(found)
     assert np.all(np.isfinite(found_rows[:, 1]))
     bad = np.isnan(found_rows[:, 2])

@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stepping import MODEL, PACK, irregular_signals, online_of, step_through
 
-from cangauge.model.effects.base import Load, Reading, Signals, Values
+from cangauge.model.effects.base import Load, Signals, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.first_order import Lag, decaying_sum, low_passed
 from cangauge.model.published import CAPACITY_AH
+from cangauge.types import Sample
 
 
 @dataclass
@@ -107,9 +108,9 @@ def test_online_a_voltage_leaves_with_the_sample_of_its_current() -> None:
     online = online_of(
         ExtendedModel(MODEL, CAPACITY_AH).with_effect(LIBRARY["time_skew"], {"skew_s": 0.5})
     )
-    assert online.correct(Reading(10.0, 1.0, 371.0, 20.0)) == []
-    assert online.correct(Reading(10.25, 2.0, 372.0, 20.0)) == []
-    assert online.correct(Reading(10.5, 3.0, 373.0, 20.0)) == [Reading(10.0, 3.0, 371.0, 20.0)]
+    assert online.correct(Sample(10.0, 1.0, 371.0, 20.0)) == []
+    assert online.correct(Sample(10.25, 2.0, 372.0, 20.0)) == []
+    assert online.correct(Sample(10.5, 3.0, 373.0, 20.0)) == [Sample(10.0, 3.0, 371.0, 20.0)]
 
 
 @pytest.mark.parametrize("skew_s", [-1.5, 1.5])
@@ -118,7 +119,7 @@ def test_memory_of_the_skew_is_bounded(skew_s: float) -> None:
         ExtendedModel(MODEL, CAPACITY_AH).with_effect(LIBRARY["time_skew"], {"skew_s": skew_s})
     )
     for k in range(5_000):
-        online.correct(Reading(0.01 * k, float(k % 7), 370.0, 20.0))
+        online.correct(Sample(0.01 * k, float(k % 7), 370.0, 20.0))
     assert len(online.state()[1]) < 8 * 150
 
 

@@ -14,11 +14,12 @@ from cangauge.bus.recording import read_log
 from cangauge.identify.rows import fit_rows
 from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
-from cangauge.model.effects.base import Reading, Signals
+from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
+from cangauge.types import Sample
 from synthetic import synthetic_log, within_c
 
 ALL = tuple((effect, middle(effect)) for effect in EFFECTS)
@@ -52,7 +53,7 @@ def test_without_effects_it_equals_the_model_on_a_real_trip(shared_data: Path) -
 def test_without_effects_the_online_form_equals_the_model() -> None:
     online = online_of(ExtendedModel(MODEL, CAPACITY_AH))
     assert online.capacity_ah == CAPACITY_AH
-    reading = Reading(1.0, 50.0, 370.0, 20.0)
+    reading = Sample(1.0, 50.0, 370.0, 20.0)
     assert online.correct(reading) == (reading,)
     assert online.counted(-33.3) == -33.3
     assert online.initial_soc_pct(88.8) == 88.8

@@ -159,16 +159,6 @@ current over the sum of the resistances (0): contacts and electrolyte respond at
 does not. Values in between mix both."""
 
 
-class Reading(NamedTuple):
-    """One sample. Voltage and temperature may be NaN where missing; current never is."""
-
-    time_s: float
-    current_a: float
-    """Positive = discharge [A]."""
-    voltage_v: float
-    temperature_c: float
-
-
 class Signals(NamedTuple):
     """Measured signals, shape (n,) each; positive current discharges."""
 
