@@ -35,6 +35,7 @@ from cangauge.model.coulomb_counting import (
 from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve, VoltageModel
+from cangauge.types import Reason
 from synthetic import synthetic_log, voltage_model
 
 TRUTH = leaf_2012_model()
@@ -139,6 +140,31 @@ def test_left_out_logs_widen_the_covariance() -> None:
 
     assert scale(0.0) == 1.0
     assert scale(10.0) > 3.0
+
+
+@pytest.mark.parametrize("noise_v", [0.3, 1.0])
+def test_like_logs_lower_the_strain_that_a_model_allows(noise_v: float) -> None:
+    """Another pack is flagged by the model of logs that agree, and its own further logs are not."""
+    model = fit(trips(6, noise_v=noise_v), capacity_ah=CAPACITY_AH, cells=96).model
+    noise = model.noise.model_copy(update={"left_out_strain": 1.0})
+    lenient = model.model_copy(update={"noise": noise})
+    assert 0.25 <= model.noise.left_out_strain < 0.5  # two logs of the prior, six real ones
+    volts = 96.0 * OXIDE.curve_v + 0.08 * (50.0 - KNOTS_PCT)
+    loads = CELLS.loads.model_copy(update={"resistance_ohm": (-0.12, -0.01, -0.01, -0.005)})
+    other = replace(CELLS, curve=HermiteCurve.rising(KNOTS_PCT, volts), loads=loads)
+
+    def mismatch(log: Log, its_model: cangauge.Model) -> bool:
+        table = cangauge.estimate(replace(log, soc_pct=None), its_model)
+        return bool(((table.reasons & Reason.MODEL_MISMATCH) != 0).any())
+
+    foreign = trips(4, model=other, noise_v=noise_v)
+    assert all(mismatch(log, model) for log in foreign)
+    assert not all(mismatch(log, lenient) for log in foreign)
+    assert not any(mismatch(log, model) for log in trips(9, noise_v=noise_v)[6:])
+
+
+def test_too_few_logs_keep_the_strain_of_the_prior() -> None:
+    assert fit(trips(2), capacity_ah=CAPACITY_AH).model.noise.left_out_strain == 1.0
 
 
 def test_a_slow_log_weighs_by_its_time() -> None:

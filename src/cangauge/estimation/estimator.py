@@ -129,8 +129,8 @@ class Estimator:
         self._memory = EstimatorMemory()
         self._power = PowerModel(self.online, self.settings.limits)
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
-        # Its mean under the model: real packs stay far below, as priors are wider than packs are.
-        strain_at_most = self.online.functions.number + 4.0
+        # Its mean under the model, less where the logs of the fit stayed far below it.
+        strain_at_most = (self.online.functions.number + 4.0) * self.model.noise.left_out_strain
         self.tests = tested, float(chdtri(tested, ALARM)), strain_at_most
         of_model, of_input = self.model.temperature_source, self.settings.temperature_source
         is_same = "unknown" in {of_model, of_input} or of_model == of_input

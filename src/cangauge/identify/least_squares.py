@@ -191,6 +191,27 @@ class Solution(Distribution):
         error = float(sums.moments[-2, -1]) / sums.weight - float(row @ self.coefficients)
         return error, float(row @ self.covariance @ row)
 
+    def strain_of(self, sums: LogSums, level_v: float) -> float:
+        """Return Σ (learned/prior σ)² of what a log teaches: all coefficients, and its level.
+
+        Parameters
+        ----------
+        sums : LogSums
+            Of a log that is not among those of the solution.
+        level_v : float
+            Prior standard deviation of its level [V].
+        """
+        a = self.select @ sums.moments[:-2, -2]
+        A = self.select @ sums.moments[:-2, :-2] @ self.select.T
+        r = self.select @ sums.moments[:-2, -1] - A @ self.coefficients
+        r_log = float(sums.moments[-2, -1] - a @ self.coefficients)
+        v = (self.residual_v**2 + (ADDED_STD * self.mean_v) ** 2) * SECONDS_PER_DATUM
+        s = 1.0 / (sums.weight + v / level_v**2)
+        Lambda = np.linalg.inv(self.covariance)
+        delta = np.linalg.solve((A - s * np.outer(a, a)) / v + Lambda, (r - s * r_log * a) / v)
+        level = s * (r_log - float(a @ delta))
+        return float(delta @ Lambda @ delta) + (level / level_v) ** 2
+
     def square_error(self, sums: LogSums) -> float:
         """Return the mean square residual of a log, its level included [V²]."""
         back = np.r_[self.select.T @ self.coefficients, 0.0, -1.0]
@@ -296,20 +317,31 @@ def solve_without(
     return [by_fold[k % count] for k in range(number)]
 
 
-def left_out_scale(
+def left_out(
     sums: Sequence[LogSums], without: Sequence[Solution], chemistry: Chemistry
-) -> float:
-    """Return κ²: mean squares of left-out logs' errors over those stated, 1 at least."""
-    squares = []
+) -> tuple[float, float]:
+    """Return what left-out logs show of the stated uncertainty.
+
+    Returns
+    -------
+    scale : float
+        κ²: mean squares of their errors over those stated, 1 at least.
+    strain : float
+        Mean of `Solution.strain_of` over its mean under the model, 1 at most.
+    """
+    squares, strains = [], []
     for item, other in zip(sums, without, strict=False):
         if item.weight < SECONDS_PER_DATUM:
             continue
         error, variance = other.mean_error(item)
-        level2 = float(chemistry.level_v(other.mean_v, item.mean_c)) ** 2
+        level_v = float(chemistry.level_v(other.mean_v, item.mean_c))
         fast2 = other.residual_v**2 + (ADDED_STD * other.mean_v) ** 2
         fast2 *= SECONDS_PER_DATUM / item.weight
-        squares.append(error**2 / (variance + level2 + fast2))
-    return max(1.0, (LEFT_OUT_PRIOR + float(np.sum(squares))) / (LEFT_OUT_PRIOR + len(squares)))
+        squares.append(error**2 / (variance + level_v**2 + fast2))
+        strains.append(other.strain_of(item, level_v) / (chemistry.functions + 1))
+    number = LEFT_OUT_PRIOR + len(squares)
+    scale = max(1.0, (LEFT_OUT_PRIOR + float(np.sum(squares))) / number)
+    return scale, min(1.0, (LEFT_OUT_PRIOR + float(np.sum(strains)) / scale) / number)
 
 
 def solve_scaled(
@@ -320,5 +352,6 @@ def solve_scaled(
     """Return the posterior scaled by left-out logs, and those of `solve_without`."""
     solution = solve(sums, pack, amplitude_std)
     without = solve_without(sums, pack, amplitude_std)
-    scale = left_out_scale(sums, without, pack.chemistry)
-    return replace(solution, covariance=solution.covariance * scale, scale=scale), without
+    scale, strain = left_out(sums, without, pack.chemistry)
+    covariance = solution.covariance * scale
+    return replace(solution, covariance=covariance, scale=scale, strain=strain), without

@@ -40,10 +40,12 @@ def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArr
     # Limiting each step to `FULL_DECAY` keeps e^elapsed finite.
     elapsed = np.zeros(decay.size + 1)
     np.cumsum(np.minimum(decay, FULL_DECAY), out=elapsed[1:])
-    blocks = np.arange(BLOCK_TIME_CONSTANTS, elapsed[-1], BLOCK_TIME_CONSTANTS)
-    edges = np.concatenate(([0], np.searchsorted(elapsed[1:], blocks), [decay.size]))
+    edges = [0, decay.size]
+    if elapsed[-1] > BLOCK_TIME_CONSTANTS:
+        blocks = np.arange(BLOCK_TIME_CONSTANTS, elapsed[-1], BLOCK_TIME_CONSTANTS)
+        edges[1:1] = np.searchsorted(elapsed[1:], blocks).tolist()
     last = start
-    for first, after in itertools.pairwise(edges.tolist()):
+    for first, after in itertools.pairwise(edges):
         grown = np.exp(elapsed[first + 1 : after + 1] - elapsed[first])
         part = result[first + 1 : after + 1]
         np.cumsum(drive[first:after] * grown, out=part)
@@ -91,7 +93,8 @@ class Lag:
             times, inputs, skip = time_s, values, 0
         else:
             latest_s, latest, first = self._last
-            times, inputs, skip = np.r_[latest_s, time_s], np.r_[latest, values], 1
+            times, inputs = np.concatenate(([latest_s], time_s)), np.concatenate(([latest], values))
+            skip = 1
         seconds = np.diff(times)
         result = decaying_sum(*self._increments(seconds, inputs), first)[skip:]
         self._last = (float(times[-1]), float(inputs[-1]), float(result[-1]))

@@ -447,7 +447,14 @@ class Model(Fields):
             curve=CurveKnots(soc_pct=tuple(KNOTS_PCT.tolist()), voltage_v=tuple(curve_v)),
             loads=loads,
             functions=FunctionFields.of(chemistry, covariance, loads, fields["capacity_ah"]),
-            noise=Noise.of(chemistry, known.mean_v, known.residual_v, judged, known.scale),
+            noise=Noise.of(
+                chemistry,
+                known.mean_v,
+                known.residual_v,
+                judged,
+                scale=known.scale,
+                strain=known.strain,
+            ),
             **fields,
         )
 

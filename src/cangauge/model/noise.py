@@ -38,6 +38,8 @@ class Noise(Fields):
     """Rms residual of the rows of the fit."""
     left_out_scale: Annotated[float, Field(ge=1, le=1e6)] = 1.0
     """κ²: `level_std_v` and the covariance of the coefficients contain it already."""
+    left_out_strain: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """What one log teaches a fit of the others, over its mean under the model; 1 without logs."""
     voltage_mae_pct: NonNegativeFloat
     voltage_rmse_v: Volts
     """Errors of left-out logs."""
@@ -50,11 +52,14 @@ class Noise(Fields):
         mean_v: float,
         residual_v: float,
         judged: Mapping[str, Any],
+        *,
         scale: float = 1.0,
+        strain: float = 1.0,
     ) -> Self:
         """Return the errors of a chemistry, of mean voltage V0 [V] and rms residual [V].
 
-        `judged` holds `voltage_mae_pct`, `voltage_rmse_v` and `judged_on`; `scale` is κ².
+        `judged` holds `voltage_mae_pct`, `voltage_rmse_v` and `judged_on`; `scale` is κ², and
+        `strain` is `left_out_strain`.
         """
         typical = CHEMISTRIES[chemistry]
         return cls(
@@ -65,6 +70,7 @@ class Noise(Fields):
             cold_exponent=typical.cold_exponent,
             residual_std_v=residual_v,
             left_out_scale=scale,
+            left_out_strain=strain,
             **judged,
         )
 

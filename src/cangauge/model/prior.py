@@ -239,6 +239,8 @@ class Distribution:
         Mean voltage V0 [V] and temperature T̄ [°C] of the logs.
     scale : float
         κ²: how much larger than stated the errors of left-out logs are.
+    strain : float
+        What a left-out log teaches, relative to its mean under the model; 1 at most.
     """
 
     coefficients: FloatArray
@@ -248,6 +250,7 @@ class Distribution:
     mean_v: float
     mean_c: float
     scale: float = 1.0
+    strain: float = 1.0
 
 
 @lru_cache(maxsize=256)
