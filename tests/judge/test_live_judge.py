@@ -14,7 +14,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
-from cangauge.extras.judge.live import PAGE, RESULT, LiveJudge, Stored
+from cangauge.extras.judge.live import PAGE, RESULT, LiveJudge, stored_logs
 from cangauge.logs.log import Log
 from cangauge.service.run import Service
 from cangauge.service.status_client import Snapshot
@@ -54,23 +54,22 @@ def drive(judge: LiveJudge, published: dict[str, float], number: int, error_pct:
 
 
 def test_a_gauge_that_is_off_is_said_after_the_drive(tmp_path: Path) -> None:
-    stored = Stored(tmp_path, 2, JUDGE)
     published = {"soc": float("nan")}
     with (
         LoggedLines("cangauge.extras.judge") as lines,
-        closing(LiveJudge(stored, lambda: published["soc"])) as judge,
+        closing(LiveJudge(tmp_path, 2, JUDGE, lambda: published["soc"])) as judge,
     ):
         drive(judge, published, 1, 15.0)
         judge.on_snapshot(Snapshot(0.0, {}))
-        assert not stored.logs()  # the drive goes on
+        assert not stored_logs(tmp_path)  # the drive goes on
         judge._came_s -= 601.0  # ten minutes of silence
         judge.on_snapshot(Snapshot(judge._came_s + 601.0, {}))
         assert waits(lambda: bool(judge.trouble), 60.0), lines.lines
         assert "% SoC too high now." in judge.trouble
-    result = json.loads((stored.folder / RESULT).read_text())
+    result = json.loads((tmp_path / RESULT).read_text())
     assert result["now"]["error_pct"] == pytest.approx(15.0, abs=3.0)
-    assert "judge" in (stored.folder / PAGE).read_text()
-    (path,) = stored.logs()
+    assert "judge" in (tmp_path / PAGE).read_text()
+    (path,) = stored_logs(tmp_path)
     kept = read_log(path)
     assert kept.soc_pct is not None
     assert np.median(np.diff(kept.time_s)) == pytest.approx(1.0)
@@ -80,34 +79,33 @@ def test_a_gauge_that_is_off_is_said_after_the_drive(tmp_path: Path) -> None:
 def test_a_gauge_that_is_right_is_no_trouble_and_logs_outlive_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stored, old = Stored(tmp_path, 1, printing(OPINION)), tmp_path / "20200101T000000.parquet"
+    command, old = printing(OPINION), tmp_path / "20200101T000000.parquet"
     published = {"soc": float("nan")}
-    judge = LiveJudge(stored, lambda: published["soc"])
+    judge = LiveJudge(tmp_path, 1, command, lambda: published["soc"])
     drive(judge, published, 1, 0.0)
     judge.close()  # written, not judged
-    assert not (stored.folder / RESULT).exists()
-    (written,) = stored.logs()
+    assert not (tmp_path / RESULT).exists()
+    (written,) = stored_logs(tmp_path)
     written.rename(old)
     with (
         caplog.at_level("INFO", "cangauge.extras.judge"),
-        closing(LiveJudge(stored, lambda: published["soc"])) as again,
+        closing(LiveJudge(tmp_path, 1, command, lambda: published["soc"])) as again,
     ):
-        assert waits((stored.folder / RESULT).is_file)  # begun at the start
+        assert waits((tmp_path / RESULT).is_file)  # begun at the start
         drive(again, published, 2, 0.0)
         drive(again, published, 3, 0.0)  # a pause of a night between them
         assert waits(lambda: caplog.text.count("second opinion") == 2)
         assert again.trouble == ""
-    assert len(stored.logs()) == 1  # `keep`
+    assert len(stored_logs(tmp_path)) == 1  # `keep`
     assert not old.exists()
 
 
 def test_what_is_known_outlives_a_stop_and_says_since_when(tmp_path: Path) -> None:
     text = "The gauge stands still at 61.0 % since Sat 18 Nov 06:24 UTC.\nSee whether it does."
     off = OPINION | {"now": {"verdict": "off"}, "text": text}
-    stored = Stored(tmp_path, 2, printing(off))
     with (
         LoggedLines("cangauge.extras.judge") as lines,
-        closing(LiveJudge(stored, lambda: 50.0)) as judge,
+        closing(LiveJudge(tmp_path, 2, printing(off), lambda: 50.0)) as judge,
     ):
         drive(judge, {"soc": 50.0}, 1, 0.0)
         judge._end_stretch()
@@ -115,16 +113,15 @@ def test_what_is_known_outlives_a_stop_and_says_since_when(tmp_path: Path) -> No
         drive(judge, {"soc": 50.0}, 2, 0.0)
     assert json.loads((tmp_path / RESULT).read_text()) == off  # the second log is judged next time
     assert any("since Sat 18 Nov 06:24 UTC. See whether" in line for line in lines.lines)
-    assert not stored.is_judged()
+    with closing(LiveJudge(tmp_path, 2, printing(OPINION), lambda: 50.0)):
+        assert waits(lambda: json.loads((tmp_path / RESULT).read_text()) == OPINION)
 
 
 def test_a_judgement_that_fails_says_why(tmp_path: Path) -> None:
-    stored = Stored(
-        tmp_path, 2, printing({"error": {"message": "no log has the SoC"}, "exit_code": 2}, 2)
-    )
+    command = printing({"error": {"message": "no log has the SoC"}, "exit_code": 2}, 2)
     with (
         LoggedLines("cangauge.extras.judge") as lines,
-        closing(LiveJudge(stored, lambda: 50.0)) as judge,
+        closing(LiveJudge(tmp_path, 2, command, lambda: 50.0)) as judge,
     ):
         for sample in samples_of(day(1)):
             judge.on_sample(sample, NONE)

@@ -19,8 +19,8 @@ from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.bus.recording import read_log
 from cangauge.extras.inverter.gateway import Gateway, soc_fields
 from cangauge.extras.judge import suite
-from cangauge.extras.judge.live import LiveJudge, Stored
-from cangauge.extras.judge.suite import FAULTS, PlayedDrive, run_suite
+from cangauge.extras.judge.live import LiveJudge
+from cangauge.extras.judge.suite import FAULTS, Drive, run_suite
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import LoggedLines, leaf_model, waits
@@ -87,10 +87,9 @@ def test_a_flood_on_the_batterys_bus_does_not_stop_the_inverters(
 
 
 @pytest.fixture(scope="module")
-def drive() -> PlayedDrive:
+def drive() -> Drive:
     log = synthetic_log(hours=0.02, rate_hz=1.0, start_pct=80.0, end_pct=79.0)
-    assert log.soc_pct is not None
-    return PlayedDrive(log, log.soc_pct, leaf_model())
+    return log, leaf_model()
 
 
 GAUGE = """
@@ -113,21 +112,21 @@ def gauge(code: str) -> list[str]:
 
 @pytest.mark.parametrize("script", GAUGES.values(), ids=GAUGES.keys())
 def test_a_bad_gauge_is_silent_and_ends(
-    monkeypatch: pytest.MonkeyPatch, drive: PlayedDrive, script: str
+    monkeypatch: pytest.MonkeyPatch, drive: Drive, script: str
 ) -> None:
     monkeypatch.setattr(suite, "ANSWER_WITHIN_S", 0.3)
     began_s = time.monotonic()
     (score,) = run_suite(gauge(GAUGE.format(script=script)), [drive], FAULTS[:1])
-    assert score.silent == 1.0
-    assert np.isnan(score.mae_pct)
+    assert score["silent"] == 1.0
+    assert np.isnan(score["mae_pct"])
     assert time.monotonic() - began_s < 60.0
 
 
-def test_a_gauge_that_fails_to_start_again_is_silent(drive: PlayedDrive, tmp_path: Path) -> None:
+def test_a_gauge_that_fails_to_start_again_is_silent(drive: Drive, tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     once = f"import os, sys\nif os.path.exists('{mark}'): sys.exit('{{}}')\nopen('{mark}', 'w')\n"
     scores = run_suite(gauge(once + GAUGE.format(script="")), [drive], FAULTS[:2])
-    assert [score.silent for score in scores] == [1.0, 1.0]
+    assert [score["silent"] for score in scores] == [1.0, 1.0]
 
 
 def ten_minutes(judge: LiveJudge) -> None:
@@ -140,7 +139,7 @@ def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: P
     folder.mkdir()
     with (
         LoggedLines("cangauge.extras.judge") as lines,
-        closing(LiveJudge(Stored(folder, 3, ("false",)), lambda: 50.0)) as judge,
+        closing(LiveJudge(folder, 3, ("false",), lambda: 50.0)) as judge,
     ):
         shutil.rmtree(folder)
         ten_minutes(judge)
@@ -155,7 +154,7 @@ def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: P
 
 def test_a_battery_that_publishes_no_soc_leaves_a_log_that_can_be_read(tmp_path: Path) -> None:
     published = iter([50.0, 655.35, -1.0, math.nan] * 150)
-    with closing(LiveJudge(Stored(tmp_path, 3, ("false",)), lambda: next(published))) as judge:
+    with closing(LiveJudge(tmp_path, 3, ("false",), lambda: next(published))) as judge:
         ten_minutes(judge)
     (stored,) = tmp_path.glob("*.parquet")
     soc_pct = read_log(stored).soc_pct

@@ -18,7 +18,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.judge.live import Stored
+from cangauge.extras.judge.live import store, stored_logs
 from cangauge.logs.read import open_log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -76,14 +76,13 @@ def test_a_file_survives_a_kill_at_any_write(tmp_path: Path) -> None:
 
 def test_logs_of_the_judge_survive_a_kill_at_any_write(tmp_path: Path) -> None:
     rows = [(float(row), 10.0, 380.0, 20.0, 50.0) for row in range(2_000)]
-    stored = Stored(tmp_path, keep=3, command=())
     random = Random(1)  # noqa: S311 - repeatable
     for _ in range(SEEDS):
-        killed(lambda _number: stored.put(rows), tmp_path, random.uniform(0.0, 0.02))
+        killed(lambda _number: store(tmp_path, 3, rows), tmp_path, random.uniform(0.0, 0.02))
         # As what it was writing when it was killed.
         (tmp_path / ".20260101T000000.0123abcd.parquet").write_bytes(b"PAR1")
-        assert 1 <= len(stored.logs()) <= 4
-        for path in stored.logs():
+        assert 1 <= len(stored_logs(tmp_path)) <= 4
+        for path in stored_logs(tmp_path):
             assert len(open_log(path).read()) == len(rows)
 
 

@@ -158,13 +158,13 @@ def _suite(
         scores = run_suite(started_by, drives, show=show)
     rows = [
         [
-            score.fault,
-            number(score.mae_pct, 2),
-            number(score.worst_pct, 1),
-            number(score.jumps_per_h, 1),
-            "never" if score.recovery_s == math.inf else number(score.recovery_s / 60.0, 0),
-            number(None if score.cover_2sigma is None else 100.0 * score.cover_2sigma, 0),
-            number(100.0 * score.silent, 0),
+            score["fault"],
+            number(score["mae_pct"], 2),
+            number(score["worst_pct"], 1),
+            number(score["jumps_per_h"], 1),
+            "never" if score["recovery_s"] == math.inf else number(score["recovery_s"] / 60.0, 0),
+            number(None if score["cover_2sigma"] is None else 100.0 * score["cover_2sigma"], 0),
+            number(100.0 * score["silent"], 0),
         ]
         for score in scores
     ]
@@ -177,13 +177,8 @@ def _suite(
         "within 2σ [%]",
         "silent [%]",
     ]
-    result = {
-        "schema": 1,
-        "gauge": " ".join(started_by),
-        "scores": [score._asdict() for score in scores],
-    }
-    show = partial(print_table, f"{len(drives)} drives", head, rows)
-    finish(result, show, as_json=json_output)
+    result = {"schema": 1, "gauge": " ".join(started_by), "scores": scores}
+    finish(result, partial(print_table, f"{len(drives)} drives", head, rows), as_json=json_output)
 
 
 def _write_corrected(path: Path, judgement: Judgement) -> None:

@@ -1,7 +1,7 @@
 """A second opinion on the battery's own SoC while the service runs: `[judge]`.
 
 Samples are kept, one a second, with the SoC that the battery publishes. A stretch of them ends
-with a pause of ten minutes, after a day, or with the service; it is written as a log, and all logs
+with a pause of ten minutes, after a day, or with the service. It is written as a log, and all logs
 are judged by `cangauge judge` in a process of its own. The logs outlive a restart.
 """
 
@@ -13,8 +13,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -25,7 +24,7 @@ from cangauge._extras import require_extra
 from cangauge._files import write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.judge.chain import PARTED_S, SHORTEST_S
+from cangauge.extras.judge.chain import LONGEST_S, PARTED_S, SHORTEST_S
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.service.output import Output
@@ -38,9 +37,6 @@ if TYPE_CHECKING:
     from cangauge.service.config import RunConfig
     from cangauge.service.run import Service
 
-ROW_EVERY_S: Final = 1.0
-LONGEST_S: Final = 86400.0
-"""A storage battery never pauses: its logs are of a day [s]."""
 WITHIN_S: Final = 900.0
 """Longest judgement [s]: fifteen days of driving take a minute on a small computer."""
 CLOSE_WITHIN_S: Final = 2.0
@@ -50,57 +46,28 @@ PAGE: Final = "judgement.html"
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
-    """Where the logs lie, how many are kept, and what judges them.
+def stored_logs(folder: Path) -> list[Path]:
+    """Return the logs in a folder in order of time."""
+    # A hidden one is what a killed service was writing.
+    return sorted(path for path in folder.glob("*.parquet") if not path.name.startswith("."))
+
+
+def store(folder: Path, keep: int, rows: Sequence[Sequence[float]]) -> None:
+    """Write rows as a log, and remove the oldest beyond `keep`.
 
     Parameters
     ----------
     folder : Path
     keep : int
-        Logs; the oldest are removed.
-    command : tuple of str
-        Judges the logs that follow; prints the object of `cangauge judge --json`.
+    rows : sequence
+        Time, current, voltage, temperature and published SoC of each.
     """
-
-    folder: Path
-    keep: int
-    command: tuple[str, ...]
-
-    def logs(self) -> list[Path]:
-        """Return the logs in order of time."""
-        found = self.folder.glob("*.parquet")
-        # A hidden one is what a killed service was writing.
-        return sorted(path for path in found if not path.name.startswith("."))
-
-    def is_judged(self) -> bool:
-        """Return whether the result is younger than the newest log."""
-        result = self.folder / RESULT
-        newest_s = max((log.stat().st_mtime for log in self.logs()), default=0.0)
-        return newest_s <= (result.stat().st_mtime if result.is_file() else 0.0)
-
-    def put(self, rows: list[tuple[float, ...]]) -> None:
-        """Write rows of time, current, voltage, temperature and published SoC as a log."""
-        time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(rows).T
-        name = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
-        log = Log(time_s, current_a, voltage_v, temperature_c, soc_pct=soc_pct, name=name)
-        write_log(log, self.folder / f"{name}.parquet")
-        for old in self.logs()[: -self.keep]:
-            old.unlink()
-
-    def judge(self) -> dict[str, Any]:
-        """Judge all logs; write the result, and a page; raise InputError with the reason if not."""
-        command = [*self.command, *map(str, self.logs())]
-        command += ["--report", str(self.folder / PAGE), "--json"]
-        ended = subprocess.run(  # noqa: S603 - our own command
-            command, capture_output=True, text=True, check=False, timeout=WITHIN_S
-        )
-        result: dict[str, Any] = json.loads(ended.stdout or "{}")
-        if ended.returncode != 0:
-            problem = result.get("error", {}).get("message", ended.stderr.strip()[-500:])
-            raise InputError(problem)
-        write_text_atomic(self.folder / RESULT, ended.stdout)
-        return result
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(rows).T
+    name = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+    log = Log(time_s, current_a, voltage_v, temperature_c, soc_pct=soc_pct, name=name)
+    write_log(log, folder / f"{name}.parquet")
+    for old in stored_logs(folder)[:-keep]:
+        old.unlink()
 
 
 class LiveJudge(Output):
@@ -108,18 +75,32 @@ class LiveJudge(Output):
 
     Parameters
     ----------
-    stored : Stored
+    folder : Path
+        Of the logs, the result and its page.
+    keep : int
+        Logs; the oldest are removed.
+    command : sequence of str
+        Judges the logs that follow; prints the object of `cangauge judge --json`.
     published_pct : callable
         Returns the SoC that the battery published last [%]; NaN before. A value that is no SoC is
         kept as NaN: a log with one would be refused, and with it the judgement of all.
     """
 
-    def __init__(self, stored: Stored, published_pct: Callable[[], float]) -> None:
-        self._stored, self._published_pct = stored, published_pct
+    def __init__(
+        self,
+        folder: Path,
+        keep: int,
+        command: Sequence[str],
+        published_pct: Callable[[], float],
+    ) -> None:
+        self._folder, self._keep, self._command = folder, keep, command
+        self._published_pct = published_pct
         self._rows: list[tuple[float, ...]] = []
         self._came_s = math.inf
-        self._worker = Worker("cangauge-judge", self._failed, jobs_at_most=2)
-        if not stored.is_judged():
+        self._worker = Worker("cangauge-judge", _failed, jobs_at_most=2)
+        newest_s = max((log.stat().st_mtime for log in stored_logs(folder)), default=0.0)
+        result = folder / RESULT
+        if newest_s > (result.stat().st_mtime if result.is_file() else 0.0):
             self._worker.submit(self._judge)
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
@@ -130,9 +111,10 @@ class LiveJudge(Output):
             return
         if self._rows:
             since_s = sample.time_s - self._rows[-1][0]
-            if since_s < 0.0 or since_s > PARTED_S or sample.time_s - self._rows[0][0] > LONGEST_S:
+            whole_s = sample.time_s - self._rows[0][0]
+            if not 0.0 <= since_s <= PARTED_S or whole_s > LONGEST_S:
                 self._end_stretch()
-            elif since_s < ROW_EVERY_S:
+            elif since_s < 1.0:
                 return
         soc_pct = self._published_pct()
         self._rows.append((*sample[:4], soc_pct if 0.0 <= soc_pct <= 100.0 else math.nan))
@@ -153,27 +135,45 @@ class LiveJudge(Output):
             return
 
         def work() -> None:
-            self._stored.put(rows)
+            store(self._folder, self._keep, rows)
             if is_judged:
                 self._judge()
 
         self._worker.submit(work)
 
     def _judge(self) -> None:
-        result = self._stored.judge()
+        """Judge all logs; write the result and a page; raise InputError with the reason if not."""
+        command = [*self._command, *map(str, stored_logs(self._folder))]
+        command += ["--report", str(self._folder / PAGE), "--json"]
+        ended = subprocess.run(  # noqa: S603 - our own command
+            command, capture_output=True, text=True, check=False, timeout=WITHIN_S
+        )
+        result: dict[str, Any] = json.loads(ended.stdout or "{}")
+        if ended.returncode != 0:
+            raise InputError(result.get("error", {}).get("message", ended.stderr.strip()[-500:]))
+        write_text_atomic(self._folder / RESULT, ended.stdout)
         text = "second opinion on the battery's own SoC: " + result["text"].replace("\n", " ")
         is_off = result["now"]["verdict"] == "off"
         self.trouble = text if is_off else ""
         emit(_LOG, logging.WARNING if is_off else logging.INFO, "judge.result", text)
 
-    @staticmethod
-    def _failed(error: Exception) -> None:
-        text = f"the battery's own SoC was not judged: {error}"
-        emit(_LOG, logging.WARNING, "judge.failed", text)
+
+def _failed(error: Exception) -> None:
+    text = f"the battery's own SoC was not judged: {error}"
+    emit(_LOG, logging.WARNING, "judge.failed", text)
 
 
-def output_of(_config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJudge]:
-    """Return what makes the judge that a configuration asks for; may raise InputError."""
+def output_of(config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJudge]:
+    """Make the folder; return what makes the judge that a configuration asks for.
+
+    Raises
+    ------
+    InputError
+        If the vehicle has no SoC of its own, or the folder cannot be made.
+    """
+    asked = config.judge
+    if asked is None:
+        raise ValueError("no [judge]")
     if vehicle.soc_reference is None:
         raise InputError(
             "the vehicle has no SoC of its own",
@@ -181,21 +181,20 @@ def output_of(_config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJ
             cure="name its signal under [soc] of the map file",
         )
     require_extra("report", "judge")
-    return make_output
-
-
-def make_output(service: Service) -> LiveJudge:
-    """Make the folder and return the judge; may raise InputError."""
-    config = service.config
-    if config.judge is None:
-        raise ValueError("no [judge]")
-    folder = Path(config.judge.folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", field="judge.folder") from error
-    command = [sys.executable, "-P", "-m", "cangauge", "judge", "-m", config.model]
+    command = [sys.executable, "-P", "-m", "cangauge", "judge", "-m", str(config.model)]
     if config.capacity_ah is not None:
         command += ["--capacity-ah", str(config.capacity_ah)]
-    stored = Stored(folder, config.judge.keep, tuple(command))
-    return LiveJudge(stored, lambda: service.pipeline.decoder.reference_soc_pct)
+
+    def make_output(service: Service) -> LiveJudge:
+        folder = Path(asked.folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot be made: {error.strerror}", field="judge.folder") from error
+
+        def published_pct() -> float:  # a reload brings another decoder
+            return service.pipeline.decoder.reference_soc_pct
+
+        return LiveJudge(folder, asked.keep, command, published_pct)
+
+    return make_output

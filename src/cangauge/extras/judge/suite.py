@@ -14,10 +14,10 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.time_source import MICROSECONDS, clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
+from cangauge.extras.judge.gauge import published_pct
 from cangauge.extras.validation.twin.simulation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.gaps import discharged_ah
@@ -41,7 +42,6 @@ from cangauge.types import Sample
 PACKS: Final = (211, 212, 213, 214)
 """Seeds of the simulated packs; no table of the estimator or the diagnosis has them."""
 DRIVES_A_PACK: Final = 3
-HOURS: Final = 0.5
 ANSWER_EVERY_S: Final = 20.0
 """Log time between two readings of the gauge [s]: as often it is compared with the truth."""
 QUIET_S: Final = 0.02
@@ -49,24 +49,13 @@ QUIET_S: Final = 0.02
 ANSWER_WITHIN_S: Final = 10.0
 """Longest wait for an answer that a gauge owes [s]: a busy machine changes no score."""
 READY_WITHIN_S: Final = 30.0
-SILENT_AT_MOST: Final = 30
-"""Readings without an answer after which a gauge counts as dead."""
-JUMP_PCT: Final = 1.0
-"""Change within `ANSWER_EVERY_S` beyond the charge that is a jump [%]."""
-RECOVERED_PCT: Final = 5.0
 TYPICAL_AH: Final = 60.0
 """Capacity for which currents of the faults are stated [Ah]; other packs: in proportion."""
 
-
 _LOG: Final = logging.getLogger(__name__)
 
-
-class PlayedDrive(NamedTuple):
-    """A drive with the true SoC of its rows [%], and the model of its pack."""
-
-    log: Log
-    true_pct: FloatArray
-    model: Model
+Drive = tuple[Log, Model]
+"""A log with the true SoC in each row, and a model of its pack."""
 
 
 class CountFault(NamedTuple):
@@ -124,60 +113,41 @@ FAULTS: Final = (
 """No fault, and twenty."""
 
 
-class Score(NamedTuple):
-    """What a gauge made of a fault, over all drives.
-
-    Errors in % SoC; shares of the readings. `recovery_s` is the time after which the error stays
-    below 5 %, on the median drive; infinite: it does not. `cover_2sigma` is None without a
-    published σ.
-    """
-
-    fault: str
-    mae_pct: float
-    worst_pct: float
-    jumps_per_h: float
-    recovery_s: float
-    cover_2sigma: float | None
-    silent: float
-
-
-def simulated_drives() -> list[PlayedDrive]:
+def simulated_drives() -> list[Drive]:
     """Return twelve drives of four simulated packs, with models of other drives of theirs."""
     found = []
     for seed in PACKS:
         runs = [simulate(seed=seed, discharge=True)]
-        runs += [simulate(seed=seed, drive=2 + k, hours=HOURS) for k in range(2 * DRIVES_A_PACK)]
+        runs += [simulate(seed=seed, drive=2 + k, hours=0.5) for k in range(2 * DRIVES_A_PACK)]
         logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
         model = fit(logs[:-DRIVES_A_PACK], capacity_ah=runs[0].pack.capacity_ah).model
-        found += _played(logs[-DRIVES_A_PACK:], model)
+        found += _every_second(logs[-DRIVES_A_PACK:], model)
     return found
 
 
-def recorded_drives(paths: Sequence[Path], model: Model) -> list[PlayedDrive]:
+def recorded_drives(paths: Sequence[Path], model: Model) -> list[Drive]:
     """Return drives of recorded logs of a model's pack; may raise InputError."""
-    return _played([open_log(path).read() for path in paths], model)
+    return _every_second([open_log(path).read() for path in paths], model)
 
 
-def _played(logs: Sequence[Log], model: Model) -> list[PlayedDrive]:
-    """Return logs with their true SoC as drives of a row a second."""
+def _every_second(logs: Sequence[Log], model: Model) -> list[Drive]:
     found = []
     for log in logs:
-        if log.soc_pct is None or not np.isfinite(log.soc_pct).all():
+        if not np.isfinite(published_pct(log)).all():
             problem, cure = "the true SoC is missing", "give logs with the true SoC in each row"
             raise InputError(problem, source=log.source, field="soc_pct", cure=cure)
         step_s = float(np.median(np.diff(log.time_s)))
-        every = slice(None, None, max(1, round(1.0 / step_s)))
-        found.append(PlayedDrive(log.rows(every), log.soc_pct[every], model))
+        found.append((log.rows(slice(None, None, max(1, round(1.0 / step_s)))), model))
     return found
 
 
 def run_suite(
     command: Sequence[str],
-    drives: Sequence[PlayedDrive],
+    drives: Sequence[Drive],
     faults: Sequence[CountFault] = FAULTS,
     show: Callable[[str], None] = _LOG.debug,
-) -> list[Score]:
-    """Play all drives with all faults to a gauge; return a score for each fault.
+) -> list[dict[str, Any]]:
+    """Play all drives with all faults to a gauge; return the scores of each fault.
 
     Parameters
     ----------
@@ -187,6 +157,14 @@ def run_suite(
     drives, faults : sequence
     show : callable, optional
         Takes what is played at present.
+
+    Returns
+    -------
+    list of dict
+        `fault`; `mae_pct` and `worst_pct`, errors over all drives [% SoC]; `jumps_per_h`;
+        `recovery_s`, the time after which the error stays below 5 %, on the median drive, infinite
+        if it does not; `cover_2sigma`, share of the readings, None without a published σ; `silent`,
+        share of the readings without an answer.
 
     Raises
     ------
@@ -206,7 +184,8 @@ def run_suite(
         gauge = _Gauge(bus, address, Path(folder), command)
         for number, fault in enumerate(faults, start=1):
             show(f"fault {number} of {len(faults)}: {fault.name}")
-            scores.append(_score(fault, drives, [gauge.play(drive, fault) for drive in drives]))
+            readings = [gauge.play(*drive, fault) for drive in drives]
+            scores.append({"fault": fault.name, **_score(drives, readings)})
     return scores
 
 
@@ -226,31 +205,33 @@ class _Gauge:
         self._was_ready = False
         self._answers_a_sample = 1.0
 
-    def play(self, drive: PlayedDrive, fault: CountFault) -> FloatArray:
+    def play(self, log: Log, model: Model, fault: CountFault) -> FloatArray:
         """Play a drive to a new gauge; return row, SoC and σ [%] of each reading, shape (3, n).
 
         SoC and σ are NaN where the gauge said nothing.
         """
-        model = self._folder / f"{drive.model.made.fingerprint[:16]}.json"
-        drive.model.save(model)
-        start_pct = min(max(float(drive.true_pct[0]) + fault.start_pct, 0.0), 100.0)
+        path = self._folder / f"{model.made.fingerprint[:16]}.json"
+        model.save(path)
+        start_pct = float(np.clip(published_pct(log)[0] + fault.start_pct, 0.0, 100.0))
         places = {
             "interface": self._address.interface,
             "channel": self._address.channel,
-            "port": self._address.options["port"],
-            "model": model,
-            "capacity_ah": f"{drive.model.capacity_ah:g}",
+            "port": str(self._address.options["port"]),
+            "model": str(path),
+            "capacity_ah": f"{model.capacity_ah:g}",
             "soc": f"{start_pct:.2f}",
         }
-        command = [_filled(word, places) for word in self._command]
-        with (self._folder / "gauge.log").open("wb") as log:
+        command = list(self._command)
+        for name, value in places.items():  # other braces are the command's own
+            command = [word.replace(f"{{{name}}}", value) for word in command]
+        with (self._folder / "gauge.log").open("wb") as output:
             try:
-                process = subprocess.Popen(command, stdout=log, stderr=log)  # noqa: S603 - given
+                process = subprocess.Popen(command, stdout=output, stderr=output)  # noqa: S603 - given
             except OSError as error:
                 raise InputError(f"cannot be started: {error}", field="COMMAND") from error
             try:
                 is_ready = self._becomes_ready(process)
-                return self._readings(drive, fault, is_ready=is_ready)
+                return self._readings(log, model, fault, is_ready=is_ready)
             finally:
                 process.terminate()
                 try:
@@ -277,10 +258,10 @@ class _Gauge:
         text = f"{' '.join(self._command)}: {problem} publishing SOC_ESTIMATE"
         raise CangaugeError(f"{text}; it said: {said}" if said else text)
 
-    def _readings(self, drive: PlayedDrive, fault: CountFault, *, is_ready: bool) -> FloatArray:
+    def _readings(self, log: Log, model: Model, fault: CountFault, *, is_ready: bool) -> FloatArray:
         """Send a drive to a gauge that is ready, and read it every `ANSWER_EVERY_S`."""
-        log, encoder = drive.log, FrameEncoder(self._vehicle)
-        current_a, sent = fault.current_a(log, drive.model.capacity_ah), fault.sent(log)
+        encoder = FrameEncoder(self._vehicle)
+        current_a, sent = fault.current_a(log, model.capacity_ah), fault.sent(log)
         since_s = log.time_s - log.time_s[0]
         parted = np.flatnonzero(np.diff((since_s / ANSWER_EVERY_S).astype(int))) + 1
         batches = np.split(np.arange(len(log)), parted)
@@ -293,67 +274,53 @@ class _Gauge:
                 for frame in encoder.encode(Sample(*columns[:, row].tolist())):
                     self._bus.send(frame)
             readings[1:, number] = self._answer(int(sent[rows].sum()))
-            last = readings[1, max(0, number + 1 - SILENT_AT_MOST) : number + 1]
-            if last.size == SILENT_AT_MOST and np.isnan(last).all():
-                break
         return readings
 
     def _answer(self, samples: int) -> tuple[float, float]:
         """Return SoC and σ after so many samples; NaN if the gauge said nothing.
 
         It owes as many answers as its samples: the clock of the samples is that of the bus. One
-        that has sent fewer is not waited for as long again.
+        that has sent fewer is not waited for as long again. What it sends by its own clock counts
+        too, until it is quiet.
         """
         found, got = (math.nan, math.nan), 0
-        if not samples:
-            return found
         owed = math.ceil(samples * self._answers_a_sample)
-        until_s = time.monotonic() + ANSWER_WITHIN_S
-        while time.monotonic() < until_s:
-            # What it sends by its own clock counts too: listen on until it is quiet.
-            message = self._bus.receive(until_s - time.monotonic() if got < owed else QUIET_S)
-            if message is None:
-                break
-            if message.arbitration_id == self._id and len(message.data) == 8:
+        last_s = time.monotonic() + ANSWER_WITHIN_S
+        until_s = last_s if owed else time.monotonic() + QUIET_S
+        while samples and (left_s := until_s - time.monotonic()) > 0.0:
+            message = self._bus.receive(left_s)
+            if message and message.arbitration_id == self._id and len(message.data) == 8:
                 got += 1
                 soc_pct, std_pct = (codec.decode(message.data) for codec in self._codecs)
                 found = soc_pct, std_pct
+                if got >= owed:
+                    until_s = min(last_s, time.monotonic() + QUIET_S)
         if got < owed:
             self._answers_a_sample = got / samples
         return found
 
 
-def _filled(word: str, places: Mapping[str, object]) -> str:
-    """Return a word of a command with its places filled; other braces are the command's own."""
-    for name, value in places.items():
-        word = word.replace(f"{{{name}}}", str(value))
-    return word
-
-
-def _score(
-    fault: CountFault, drives: Sequence[PlayedDrive], readings: Sequence[FloatArray]
-) -> Score:
+def _score(drives: Sequence[Drive], readings: Sequence[FloatArray]) -> dict[str, Any]:
     errors, sigmas, recoveries, jumps, hours = [], [], [], 0, 0.0
-    for (log, true_pct, model), (rows, soc_pct, std_pct) in zip(drives, readings, strict=True):
+    for (log, model), (rows, soc_pct, std_pct) in zip(drives, readings, strict=True):
         at = rows.astype(np.intp)
-        error, since_s = soc_pct - true_pct[at], log.time_s[at] - log.time_s[0]
-        bad = ~(np.abs(error) < RECOVERED_PCT)  # silence is no recovery
+        error, since_s = soc_pct - published_pct(log)[at], log.time_s[at] - log.time_s[0]
+        bad = ~(np.abs(error) < 5.0)  # silence is no recovery
         recoveries.append(math.inf if bad[-1] else float(np.max(since_s[bad], initial=0.0)))
-        known = np.isfinite(error)
         drawn_pct = 100.0 * discharged_ah(log.time_s, log.current_a)[at] / model.capacity_ah
-        jumps += int((np.abs(np.diff((soc_pct + drawn_pct)[known])) > JUMP_PCT).sum())
+        jumps += int((np.abs(np.diff((soc_pct + drawn_pct)[np.isfinite(error)])) > 1.0).sum())
         hours += since_s[-1] / 3600.0
         errors.append(error)
         sigmas.append(std_pct)
     error, std = np.concatenate(errors), np.concatenate(sigmas)
-    known = np.abs(error[np.isfinite(error)])
-    covered = (np.abs(error) <= 2.0 * std)[np.isfinite(error) & np.isfinite(std)]
-    return Score(
-        fault=fault.name,
-        mae_pct=float(known.mean()) if known.size else math.nan,
-        worst_pct=float(known.max()) if known.size else math.nan,
-        jumps_per_h=jumps / hours if known.size else math.nan,
-        recovery_s=float(np.median(recoveries)),
-        cover_2sigma=float(covered.mean()) if covered.size else None,
-        silent=float(np.isnan(error).mean()),
-    )
+    known = np.isfinite(error)
+    sizes = np.abs(error[known]) if known.any() else np.array([math.nan])
+    covered = (np.abs(error) <= 2.0 * std)[known & np.isfinite(std)]
+    return {
+        "mae_pct": float(sizes.mean()),
+        "worst_pct": float(sizes.max()),
+        "jumps_per_h": jumps / hours if known.any() else math.nan,
+        "recovery_s": float(np.median(recoveries)),
+        "cover_2sigma": float(covered.mean()) if covered.size else None,
+        "silent": float(1.0 - known.mean()),
+    }
