@@ -15,7 +15,6 @@ import pytest
 
 import cangauge
 from cangauge.__main__ import main
-from cangauge.extras.judge.weak import CURVE_PCT, weak_cell
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
 
@@ -298,8 +297,8 @@ def test_a_weak_cell_is_named_and_the_pack_is_as_empty_as_it(pack: Pack, lack_pc
         assert names(judgement) == []
         return
     assert names(judgement) == ["weak_cell"]
-    assert judgement.weakest is not None
-    assert judgement.weakest.number == 8
+    assert judgement.faults[0].cell == 8
+    assert "cell 8 lacks" in judgement.text
     low, high = judgement.faults[0].interval
     assert low < lack_pct < high
     behind = lack_pct * (100.0 - logs[1].soc_pct[-1]) / (100.0 - lack_pct)
@@ -309,15 +308,18 @@ def test_a_weak_cell_is_named_and_the_pack_is_as_empty_as_it(pack: Pack, lack_pc
 def test_a_weak_cell_is_not_read_below_its_empty(pack: Pack) -> None:
     model, _ = pack
     rng = np.random.default_rng(2)
-    soc = np.linspace(100.0, 0.0, 400)
+    time_s, soc = np.arange(0.0, 12000.0, 30.0), np.linspace(100.0, 0.0, 400)
+    amps = np.full(soc.size, 36.0 * model.capacity_ah / 120.0)
+    log = cangauge.Log(time_s, amps, np.full(soc.size, 300.0), np.full(soc.size, 20.0), soc_pct=soc)
+    log = replace(log, voltage_v=model.predict(log).voltage_v)
+    curve = model.voltage_model().pseudo_ocv
     lack = np.r_[18.0, rng.normal(0.0, 0.5, 11)]
-    curve_v = model.voltage_model().pseudo_ocv(CURVE_PCT) / 12.0
     theirs = np.maximum(100.0 - (100.0 - soc[:, None]) / (1.0 - lack / 100.0), -5.0)
-    volts = np.interp(theirs, CURVE_PCT, curve_v) + rng.normal(0.0, 0.002, theirs.shape)
-    found = weak_cell([volts], [soc], [np.full(soc.size, 10.0)], curve_v)
-    assert found is not None
-    assert found.number == 1
-    assert abs(found.lack_pct - 18.0) < 2.0 * found.std_pct
+    change = curve(theirs.ravel()).reshape(theirs.shape) - curve(soc)[:, None]
+    volts = (log.voltage_v[:, None] + change) / 12.0 + rng.normal(0.0, 0.002, theirs.shape)
+    (found,) = cangauge.judge([log], model, cell_voltages=[CellColumns(1, volts)]).faults
+    assert (found.name, found.cell) == ("weak_cell", 1)
+    assert abs(found.size - 18.0) < 2.0 * found.std
 
 
 def test_the_gauges_own_count_gives_the_capacity(pack: Pack) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
-from cangauge.extras.judge.gauge import GaugeRecord, is_limit, read_published, resolution_pct
+from cangauge.extras.judge.gauge import is_limit, read_published, resolution_pct
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, candidates
@@ -30,8 +30,6 @@ from cangauge.model.model_file import Model
 from cangauge.model.prior import CHEMISTRIES
 from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis, resistance_factor
 
-BLOCK_S: Final = 30.0
-"""Length of a block of samples whose means are used [s], as in the filter."""
 BLOCKS_AT_MOST: Final = 240
 """Most blocks used of a stretch. The voltage error is correlated over 300 s, so denser blocks would
 add little information."""
@@ -41,25 +39,18 @@ PARTED_S: Final = 600.0
 """Interval without samples that ends a stretch [s]: the car may have been charged or driven."""
 SHORTEST_S: Final = 240.0
 """A shorter stretch is left out [s]: the polarization of its start has not settled."""
-SETTLING_H: Final = 0.025
-"""Voltages of this time after the start of a stretch are not used [h]: the delay line fills."""
 WANDER_S: Final = 1200.0
 """Time over which the level of the voltage also wanders [s]: the curve's features pass by, and the
 pack warms up."""
-SECANT_PCT: Final = 1.0
-"""Half width over which the curve's slope is taken [%]: about the σ of the SoC."""
 
 FULL_H: Final = 1.0 / 12.0
 """Least time for which a full charge holds its voltage [h], …"""
 FULL_C_RATE: Final = 0.05
-"""… with less current than this at its end [1/h], of either sign since the sensor may be off, …"""
-FULL_TAPER: Final = 0.5
-"""… or with one that fell by this factor, …"""
-FULL_VOLTAGE: Final = 0.998
-"""… within this of the highest voltage, and above the curve at `KNEE_PCT`: the model's and the
-typical cell's, since a fit whose logs never reached the top has no knee."""
+"""… with less current than this at its end [1/h], of either sign since the sensor may be off, or
+with half of the current that it began with, …"""
 KNEE_PCT: Final = 99.5
-"""Where the curve has turned up towards full [%]."""
+"""… above the curve at this SoC [%], where it has turned up towards full: the model's and the
+typical cell's, since a fit whose logs never reached the top has no knee."""
 SAME_CHARGE_PCT: Final = 2.0
 """Charge drawn after which a charge is another one [%]: clouds interrupt one."""
 
@@ -88,6 +79,21 @@ class Samples(NamedTuple):
     """What a unit of each of `SENSORS` adds to the SoC [%], shape (n, sensors), …"""
     sensor_v: FloatArray
     """… and to the voltage beside it [V]."""
+    shown_pct: FloatArray
+    """y [%]; NaN where there is none."""
+    count_pct: FloatArray
+    """y + Q where y is a count [%]; NaN elsewhere."""
+    is_cut: BoolArray
+    """Whether another piece of the count begins."""
+    held_pct: FloatArray
+    """Charge that moves while y is held [%]; at a limit, away from it."""
+    step_pct: FloatArray
+    """Resolution of y [%]."""
+
+    @property
+    def clock_h(self) -> FloatArray:
+        """Hours in which the stretches lie so far apart that interpolation never joins two."""
+        return self.hours + 1e6 * self.stretch
 
 
 class Stretch(NamedTuple):
@@ -116,70 +122,53 @@ class Chain:
     ----------
     stretches : list of Stretch
     samples, blocks : Samples
-    published : GaugeRecord
-        At each sample.
-    row_piece : array of shape (samples,)
+    row_piece, piece : array of shape (samples,), (blocks,)
         Number of the piece of a count, in order of time; −1 where there is none.
-    piece, count_pct, is_full : array of shape (blocks,)
-        Piece; y + Q, NaN where y is no count; and whether a charge has ended full.
+    is_full : array of shape (blocks,)
+        Whether a charge has ended full.
     """
 
     def __init__(self, logs: Sequence[Log], model: Model) -> None:
         self.model, self.extended = model, model.extended_model()
         self.functions = model.principal_functions()
-        cuts, parts, published = (
-            list[tuple[int, slice, bool]](),
-            list[Samples](),
-            list[GaugeRecord](),
-        )
+        cuts, parts = list[tuple[int, slice, bool]](), list[Samples]()
         for number, log in enumerate(logs):
             step_pct = resolution_pct(log)
             for rows, continues in _uninterrupted(log):
-                part = log.rows(rows)
-                parts.append(_samples(len(parts), part, self.extended))
-                published.append(read_published(part, parts[-1].drawn_pct, step_pct))
+                parts.append(_samples(len(parts), log.rows(rows), self.extended, step_pct))
                 cuts.append((number, rows, continues))
-        if not any(np.isfinite(each.shown_pct).any() for each in published):
+        known = [part.shown_pct[np.isfinite(part.shown_pct)] for part in parts]
+        if not any(shown.size for shown in known):
             raise InputError(
                 "no stretch of samples is long enough",
                 cure=f"give logs of at least {SHORTEST_S / 60.0:.0f} minutes, better half an hour"
                 " with changing load",
             )
-        for before, after in pairwise(published):
-            known = [each.shown_pct[np.isfinite(each.shown_pct)] for each in (before, after)]
-            if all(each.size for each in known):  # a limit ends a piece also where it ends a log
-                after.is_cut[0] |= is_limit(known[0][-1]) | is_limit(known[1][0])
-        self.samples = samples = Samples(*_joined(parts))
-        self.published = GaugeRecord(*_joined(published))
-        is_count = np.isfinite(self.published.count_pct)
-        self.row_piece = np.where(is_count, np.cumsum(self.published.is_cut), -1)
-        block = np.floor(3600.0 * samples.hours / BLOCK_S)
-        is_first = np.diff(block, prepend=-1.0) != 0.0
-        first = np.flatnonzero(is_first | (np.diff(samples.stretch, prepend=-1) > 0))
-        whole = _means(samples, first)
-        used, is_full = _used(whole, len(cuts), model)
-        of_used: list[Any] = [each[used] for each in whole]
-        self.blocks = blocks = Samples(*of_used)
-        blocks.voltage_v[blocks.hours < SETTLING_H] = np.nan
+        for number, (before, after) in enumerate(pairwise(known), start=1):
+            # A limit ends a piece also where it ends a log.
+            parts[number].is_cut[0] |= bool(is_limit(np.append(before[-1:], after[:1])).any())
+        self.samples = samples = Samples(*map(np.concatenate, zip(*parts, strict=True)))
+        piece = np.cumsum(samples.is_cut)
+        self.row_piece = np.where(np.isfinite(samples.count_pct), piece, -1)
+        block = np.floor(3600.0 * samples.hours / model.noise.block_s)
+        parted = np.diff([samples.stretch, block, piece], prepend=-1.0)
+        first = np.flatnonzero(parted.any(axis=0))
+        every = _means(samples, first)
+        used, is_full = _used(every, len(cuts), model)
+        used = np.union1d(used, np.flatnonzero(np.diff(piece[first], prepend=0)))
+        first = first[used]
+        of_used: list[Any] = [each[used] for each in every]
+        # A count holds until the next block that is used; a coarse one is seldom known.
+        count_pct = _means(samples, first).count_pct
+        self.blocks = blocks = Samples(*of_used)._replace(count_pct=count_pct)
+        # The delay line fills.
+        blocks.voltage_v[blocks.hours < 3.0 * model.noise.block_s / 3600.0] = np.nan
         self.is_full = is_full[used]
-        self.piece, self.count_pct = self._counts([*first[used], samples.hours.size])
+        self.piece = np.where(np.isfinite(count_pct), piece[first], -1)
         self.stretches = [
             Stretch(log, rows, _places(samples.stretch, k), _places(blocks.stretch, k), continues)
             for k, (log, rows, continues) in enumerate(cuts)
         ]
-
-    def _counts(self, edges: Sequence[int]) -> tuple[IntArray, FloatArray]:
-        """Return piece and mean count of the rows from each edge to the next.
-
-        Of two pieces in a window it is the one with more rows.
-        """
-        piece, count = np.full(len(edges) - 1, -1), np.full(len(edges) - 1, np.nan)
-        for k, (low, high) in enumerate(pairwise(edges)):
-            known = low + np.flatnonzero(self.row_piece[low:high] >= 0)
-            if known.size:
-                piece[k] = self.row_piece[known[known.size // 2]]
-                count[k] = self.published.count_pct[known[self.row_piece[known] == piece[k]]].mean()
-        return piece, count
 
     def sensor(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Return the change of SoC [%] and of voltage [V] by a unit of one of `SENSORS`."""
@@ -195,9 +184,8 @@ class Chain:
         return np.asarray(volts)
 
     def slope(self, soc_pct: FloatArray) -> FloatArray:
-        """Return the slope of the voltage over the SoC at each block [V/%]."""
-        high_v, low_v = (self.voltage_v(soc_pct + step) for step in (SECANT_PCT, -SECANT_PCT))
-        return np.asarray((high_v - low_v) / (2.0 * SECANT_PCT))
+        """Return the slope of the voltage over the SoC at each block, over 2 % of it [V/%]."""
+        return 0.5 * (self.voltage_v(soc_pct + 1.0) - self.voltage_v(soc_pct - 1.0))
 
     def function_columns(self, soc_pct: FloatArray) -> FloatArray:
         """Return what the principal functions add to the voltage [V], shape (blocks, functions)."""
@@ -217,72 +205,47 @@ class Chain:
         return np.asarray(best[self.blocks.stretch] - self.blocks.drawn_pct)
 
     @cached_property
-    def _axis_v(self) -> FloatArray:
-        return np.asarray(self.model.noise.soc_std_pct * self.slope(self.fitting_pct))
-
-    @cached_property
-    def _cold(self) -> FloatArray:
+    def _voltage_std(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        noise = self.model.noise
         growth = np.maximum(1.0, resistance_factor(self.blocks.temperature_c))
-        return np.asarray(growth**self.model.noise.cold_exponent)
+        cold = np.asarray(growth**noise.cold_exponent)
+        axis_v = np.asarray(noise.soc_std_pct * self.slope(self.fitting_pct))
+        return cold, axis_v, np.hypot(cold * noise.level_std_v, axis_v)
 
-    @cached_property
+    @property
     def level_v(self) -> FloatArray:
         """Standard deviation of the level of the voltage's error at each block [V]."""
-        return np.hypot(self._cold * self.model.noise.level_std_v, self._axis_v)
+        return self._voltage_std[2]
 
-    def voltage_noise(self, part: float) -> list[tuple[IntArray, FloatArray]]:
+    def voltages(self, varies: float) -> list[tuple[IntArray, FloatArray]]:
         """Return the blocks of each stretch with a voltage, and a root of the errors' covariance.
 
-        Of the model's errors a part varies within the stretch; the level that lasts it is left out.
+        `varies` is the part of the model's errors that varies within the stretch.
         """
         found, noise = [], self.model.noise
         for stretch in self.stretches:
-            places = stretch.blocks
-            at = np.flatnonzero(np.isfinite(self.blocks.voltage_v[places])) + places.start
-            cold, level_v = self._cold[at], self.level_v[at]
+            at = np.arange(stretch.blocks.start, stretch.blocks.stop)
+            at = at[np.isfinite(self.blocks.voltage_v[at])]
+            cold, axis_v, level_v = (std[at] for std in self._voltage_std)
             apart_s = 3600.0 * np.abs(self.blocks.hours[at, None] - self.blocks.hours[at])
             slow = np.outer(cold, cold) * noise.slow_std_v**2 * np.exp(-apart_s / noise.slow_time_s)
-            wander = np.outer(level_v, level_v) * np.exp(-apart_s / WANDER_S)
-            fast_v2 = (part * cold * noise.fast_std_v) ** 2
+            lasting = np.outer(level_v, level_v)
+            wander = lasting * np.exp(-apart_s / WANDER_S)
             least_v = 1e-6 * float(self.blocks.voltage_v[at].mean())
-            own = np.diag(fast_v2 + self._axis_v[at] ** 2 + least_v**2)
-            root = np.linalg.cholesky(part**2 * (slow + wander) + own)
-            found.append((at, np.asarray(root, dtype=np.float64)))
+            own = np.diag((varies * cold * noise.fast_std_v) ** 2 + axis_v**2 + least_v**2)
+            covariance = lasting + varies**2 * (slow + wander) + own
+            found.append((at, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)))
         return found
 
-    def published_or(self, other_pct: FloatArray) -> FloatArray:
-        """Return the published SoC at each block, as it would count on; else another [%]."""
-        shown = self.at_blocks(self.published.shown_pct + self.samples.drawn_pct)
-        known = np.where(np.isnan(shown), other_pct, shown - self.blocks.drawn_pct)
-        return np.clip(known, 0.0, 100.0)
-
-    def at_blocks(self, values: FloatArray, before_s: float = 0.0) -> FloatArray:
-        """Return the latest known value at each block, or `before_s` earlier."""
-        hours, found = self.blocks.hours - before_s / 3600.0, np.full(self.piece.size, np.nan)
-        for each in self.stretches:
-            known = np.flatnonzero(np.isfinite(values[each.samples])) + each.samples.start
-            if known.size:
-                found[each.blocks] = np.interp(
-                    hours[each.blocks], self.samples.hours[known], values[known]
-                )
-        return found
+    def drawn_before(self, late_s: float) -> FloatArray:
+        """Return the charge drawn so long before each block, from the start of its stretch [%]."""
+        late_h = np.minimum(late_s / 3600.0, self.blocks.hours)
+        at = self.blocks.clock_h - late_h
+        return np.interp(at, self.samples.clock_h, self.samples.drawn_pct)
 
     def at_samples(self, values: FloatArray) -> FloatArray:
         """Return values of the blocks at the samples."""
-        found = [
-            np.interp(
-                self.samples.hours[each.samples],
-                self.blocks.hours[each.blocks],
-                values[each.blocks],
-            )
-            for each in self.stretches
-        ]
-        return np.concatenate(found)
-
-
-def _joined(parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-    """Yield each array of records as one."""
-    return map(np.concatenate, zip(*parts, strict=True))
+        return np.interp(self.samples.clock_h, self.blocks.clock_h, values)
 
 
 def _places(stretch: IntArray, k: int) -> slice:
@@ -306,7 +269,7 @@ def _uninterrupted(log: Log) -> Iterator[tuple[slice, bool]]:
             yield slice(int(low), int(high)), number > 0
 
 
-def _samples(number: int, log: Log, extended: ExtendedModel) -> Samples:
+def _samples(number: int, log: Log, extended: ExtendedModel, step_pct: float) -> Samples:
     """Return the samples of a stretch, and what the effects of `SENSORS` do to them.
 
     The effects undo an error of a sensor; the columns are the error's.
@@ -320,26 +283,32 @@ def _samples(number: int, log: Log, extended: ExtendedModel) -> Samples:
         sensor_pct.append((moved.soc_pct - base.soc_pct) / one.steps)
         apart_v = base.signals.voltage_v - moved.signals.voltage_v
         sensor_v.append((apart_v + moved.beside_v - base.beside_v) / one.steps)
+    drawn_pct = 50.0 - base.soc_pct
     return Samples(
-        stretch=np.full(len(log), number),
-        time_s=log.time_s,
-        hours=(log.time_s - log.time_s[0]) / 3600.0,
-        drawn_pct=50.0 - base.soc_pct,
-        current_a=base.signals.current_a,
-        voltage_v=base.signals.voltage_v,
-        temperature_c=base.signals.temperature_c,
-        load=extended.model.load_columns(base.signals.temperature_c, base.currents_a),
-        load_v=base.beside_v,
-        drives=np.array([drive for *_, drive in base.over_soc]).reshape(-1, len(log)).T,
-        sensor_pct=np.array(sensor_pct).T,
-        sensor_v=np.array(sensor_v).T,
+        np.full(len(log), number),
+        log.time_s,
+        (log.time_s - log.time_s[0]) / 3600.0,
+        drawn_pct,
+        base.signals.current_a,
+        base.signals.voltage_v,
+        base.signals.temperature_c,
+        extended.model.load_columns(base.signals.temperature_c, base.currents_a),
+        base.beside_v,
+        np.array([drive for *_, drive in base.over_soc]).reshape(-1, len(log)).T,
+        np.array(sensor_pct).T,
+        np.array(sensor_v).T,
+        *read_published(log, drawn_pct, step_pct),
     )
 
 
 def _means(samples: Samples, first: IntArray) -> Samples:
-    """Return the means over blocks, given the first row of each."""
-    size = np.diff([*first, samples.hours.size])
-    means = [(np.add.reduceat(each, first, axis=0).T / size).T for each in samples[1:]]
+    """Return the means over blocks of what is known, given the first row of each."""
+    means = list[Any]()
+    for each in samples[1:]:
+        known = np.isfinite(each)
+        total = np.add.reduceat(np.where(known, each, 0.0), first, axis=0)
+        with np.errstate(invalid="ignore"):
+            means.append(total / np.add.reduceat(known.astype(np.float64), first, axis=0))
     return Samples(samples.stretch[first], *means)
 
 
@@ -354,19 +323,18 @@ def _used(blocks: Samples, stretches: int, model: Model) -> tuple[IntArray, Bool
         knee_v = max(knee_v, model.cells * float(np.interp(KNEE_PCT, KNOTS_PCT, typical)))
     used, is_full = [], np.zeros(blocks.hours.size, dtype=bool)
     for k in range(stretches):
-        inside = np.flatnonzero(blocks.stretch == k)
+        inside = _places(blocks.stretch, k)
         voltage_v, ends = blocks.voltage_v[inside], list[int]()
-        held = voltage_v >= max(FULL_VOLTAGE * float(voltage_v.max()), knee_v)
-        edges = inside[0] + np.flatnonzero(np.diff(held, prepend=False, append=False))
+        held = voltage_v >= max(0.998 * float(voltage_v.max()), knee_v)
+        edges = inside.start + np.flatnonzero(np.diff(held, prepend=False, append=False))
         for first, end in edges.reshape(-1, 2):
             charge = -blocks.current_a[first:end]
             is_small = abs(charge[-1]) < FULL_C_RATE * model.capacity_ah
-            has_fallen = charge[-1] < FULL_TAPER * charge.max()
             is_long = blocks.hours[end - 1] - blocks.hours[first] >= FULL_H
-            if is_long and (is_small or has_fallen):
+            if is_long and (is_small or charge[-1] < 0.5 * charge.max()):
                 ends.append(end - 1)
         drawn_pct = np.diff(blocks.drawn_pct[ends], append=np.inf)
         is_full[np.array(ends, dtype=np.intp)[drawn_pct >= SAME_CHARGE_PCT]] = True
-        stride = max(1, -(-inside.size // BLOCKS_AT_MOST))
-        used += [*inside[::stride], inside[-1]]
+        stride = max(1, -(-(inside.stop - inside.start) // BLOCKS_AT_MOST))
+        used += [*range(inside.start, inside.stop, stride), inside.stop - 1]
     return np.unique([*used, *np.flatnonzero(is_full)]), is_full

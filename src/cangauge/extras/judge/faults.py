@@ -14,56 +14,53 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.judge.chain import Chain
 
 FREE_PCT: Final = 60.0
 """Standard deviation of the SoC at the start of a stretch [%]: unknown."""
-LEVEL_PCT: Final = 15.0
-"""Standard deviation of the level of a piece that is wrong [%]: anything."""
-SCALE_PCT: Final = 8.0
-"""Standard deviation of a wrong scale or capacity [%]: what ageing takes until it is noticed."""
-SENSOR_PCT: Final = 1.5
-"""Standard deviation of the gain of a voltage sensor that is beyond its class [%]."""
 PIECE_PCT: Final = 0.5
 """Standard deviation of the level of a piece that is right [%]."""
-OFFSETS_PER_H: Final = (0.04, 0.004)
-"""Standard deviations of a current offset over the capacity [1/h]: a coarse and a good sensor."""
-LATE_S: Final = (30.0, 60.0, 120.0, 240.0, 480.0)
-"""Lags that are tried [s]."""
-LEAST_SLOPE: Final = 0.1
-"""Least slope of the curve, relative to its mean, for a SoC read from a voltage [-]."""
-
-P_LEVEL: Final = 0.5
-"""Prior probability that the level of a piece is wrong: whoever asks has a reason."""
 P_FAULT: Final = 0.05
-"""Prior probability of each other fault."""
-P_SELDOM: Final = 0.02
-"""Prior probability that the log or the model is wrong instead: that a voltage sensor is beyond its
-class, or that the pack has another capacity than the model and the gauge knows it."""
+"""Prior probability of most faults."""
 
 
 class Kind(NamedTuple):
     """A row of the table of faults."""
 
+    place: str
+    """A set of faults has one of each place."""
     unit: str
+    stds: tuple[float, ...]
+    """Prior standard deviations that are tried [unit], those of an offset over the capacity [1/h]:
+    a coarse and a good sensor. A level may be anything, a capacity or scale what ageing takes until
+    it is noticed."""
     words: str
     """With {size} and {side}."""
     sides: tuple[str, str]
-    """{side} of a positive and of a negative size."""
+    """{side} of a positive and of a negative size; "" twice where the size is positive."""
     next_step: str
     digits: int = 1
+    probability: float = P_FAULT
+    """Prior. Of a level high: whoever asks has a reason. Of the log or the model low."""
+    is_of_count: bool = True
+    """Whether only a gauge that counts charge can have it."""
 
 
 FAULTS: Final[Mapping[str, Kind]] = {
     "start_or_reset": Kind(
+        "level",
         "%",
+        (15.0,),
         "wrong start or reset, {size} too {side}",
         ("high", "low"),
         "Charge until full once, so that the gauge resets itself, and judge again.",
+        probability=0.5,
     ),
     "current_offset": Kind(
+        "offset",
         "A",
+        (0.04, 0.004),
         "the gauge counts with a current that reads {size} too {side}",
         ("high", "low"),
         "Read the current with everything off: what it shows is the offset. Calibrate its zero, or"
@@ -71,51 +68,71 @@ FAULTS: Final[Mapping[str, Kind]] = {
         2,
     ),
     "count_scale": Kind(
+        "scale",
         "%",
+        (8.0,),
         "the published SoC moves {size} too {side} for the charge",
         ("much", "little"),
         "Compare the capacity in the gauge's configuration with the pack's, and the current with a"
         " clamp meter under load.",
     ),
     "pack_capacity": Kind(
+        "scale",
         "%",
+        (8.0,),
         "the pack's capacity is {size} {side} than the gauge counts with",
         ("larger", "smaller"),
         "Log one full discharge or charge: it gives the capacity. Then state it in the gauge.",
     ),
     "model_capacity": Kind(
+        "scale",
         "%",
+        (8.0,),
         "the pack's capacity is {size} {side} than the model's, and the gauge knows it",
         ("larger", "smaller"),
         "Fit a new model to logs of these days.",
+        probability=0.02,
     ),
     "voltage_sensor": Kind(
+        "voltage",
         "%",
+        (1.5,),
         "the logged voltage reads {size} too {side}",
         ("high", "low"),
         "Put a meter on the pack's terminals at rest and compare with the log.",
+        probability=0.02,
+        is_of_count=False,
     ),
     "voltage_table": Kind(
+        "table",
         "-",
+        (1.0,),
         "the gauge follows the voltage under load, with {size} of its drop",
         ("", ""),
         "Read the gauge at rest only, or use one that counts charge.",
+        is_of_count=False,
     ),
     "late": Kind(
+        "late",
         "s",
+        (30.0, 60.0, 120.0, 240.0, 480.0),
         "the gauge is {size} late",
         ("", ""),
         "Compare the time stamps of SoC and current: the gauge, or what carries it, buffers.",
         0,
     ),
     "weak_cell": Kind(
+        "cell",
         "%",
+        (15.0,),
         "cell {cell} lacks {size} of its capacity",
         ("", ""),
         "Log one full charge and discharge with cell voltages, and balance the pack.",
     ),
     "stands_still": Kind(
+        "stand",
         "%",
+        (),
         "",
         ("", ""),
         "See whether the gauge itself stands still, or only what is logged of it, and judge again"
@@ -124,68 +141,65 @@ FAULTS: Final[Mapping[str, Kind]] = {
 }
 
 
-class Priors(NamedTuple):
-    """How well capacity, zero and voltage of the pack are known, as standard deviations [%]."""
-
-    capacity_pct: float
-    zero_pct: float
-    """Of the gauge's own zero beside the model's."""
-    voltage_pct: float
-    """Of the scale of the voltage beside the model's."""
-
-
 @dataclass(frozen=True, eq=False)
 class Column:
     """A column of the model.
 
     Parameters
     ----------
-    name : str
     std : float
         Prior standard deviation.
     soc, shown, volts : array of shape (blocks,), or 0
         What a unit adds to the true SoC and to the published one [%], each relative to a stretch
         that starts with s, and to the voltage beside the change of SoC [V].
-    place : tuple
-        A set of faults has one shape of each place. Of a level: with the number of its piece.
+    fault : str
+        A key of `FAULTS`; "" for what is always there.
     since : int
         Stretch with which it begins.
-    is_positive : bool
-        Whether its size has one sign.
-    per_unit : float
-        Size that is reported for a unit.
+    piece : int
+        Of a level; −1 otherwise.
     log_prior : float
-        Log of the prior probability relative to none; 0 for what is always there.
+        Log of the prior probability relative to none.
     """
 
-    name: str
     std: float
     soc: FloatArray | BoolArray | float = 0.0
     shown: FloatArray | BoolArray | float = 0.0
     volts: FloatArray | float = 0.0
-    place: tuple[str | int, ...] = ()
+    fault: str = ""
     since: int = 0
-    is_positive: bool = False
-    per_unit: float = 1.0
+    piece: int = -1
     log_prior: float = 0.0
 
+    @property
+    def place(self) -> tuple[str, int, int]:
+        """A set of faults has one column of each place."""
+        is_level = self.piece >= 0
+        return FAULTS[self.fault].place, self.piece, self.since if is_level else 0
 
-def healthy(chain: Chain, priors: Priors, soc_pct: FloatArray) -> list[Column]:
-    """Return what a healthy pack and gauge show; first the start of each stretch, then the zero."""
-    blocks = chain.blocks
-    starts = [blocks.stretch == k for k in range(len(chain.stretches))]
+    @property
+    def name(self) -> tuple[str, int, int]:
+        """What is said of it: shapes of one name are summed."""
+        return (self.fault, *self.place[1:])
+
+
+def healthy(chain: Chain, known: Mapping[str, float], soc_pct: FloatArray) -> list[Column]:
+    """Return what a healthy pack and gauge show; first the principal functions, then the zero.
+
+    `known` holds the standard deviations of zero, voltage and capacity [%].
+    """
+    stretch = chain.blocks.stretch
     offset_pct, offset_v = chain.sensor("current_offset")
-    capacity_ah = chain.model.capacity_ah
     return [
-        *(Column("start", FREE_PCT, soc=start, shown=start) for start in starts),
-        Column("zero", priors.zero_pct, shown=1.0),
-        *(Column("curve", 1.0, volts=each) for each in chain.function_columns(soc_pct).T),
+        *(Column(1.0, volts=each) for each in chain.function_columns(soc_pct).T),
+        Column(known["zero"], shown=1.0),
+        *(Column(FREE_PCT, stretch == k, stretch == k) for k in range(len(chain.stretches))),
         # A model is off in the same way on days that are alike: as much as from log to log.
-        Column("level", 1.0, volts=chain.level_v),
-        Column("voltage", priors.voltage_pct, volts=chain.sensor("voltage_gain")[1]),
-        Column("offset", capacity_ah / 400.0, soc=offset_pct, volts=offset_v),
-        Column("capacity", priors.capacity_pct, soc=chain.sensor("capacity")[0]),
-        *(Column("piece", PIECE_PCT, shown=chain.piece == n) for n in _pieces(chain)),
+        Column(1.0, volts=chain.level_v),
+        Column(known["voltage"], volts=chain.sensor("voltage_gain")[1]),
+        Column(chain.model.capacity_ah / 400.0, offset_pct, volts=offset_v),
+        Column(known["capacity"], chain.sensor("capacity")[0]),
+        *(Column(PIECE_PCT, shown=chain.piece == n) for n in _pieces(chain)),
     ]
 
 
@@ -205,38 +219,19 @@ def faults(chain: Chain, soc_pct: FloatArray) -> list[Column]:
 
 def _families(chain: Chain, soc_pct: FloatArray) -> Iterator[tuple[list[Column], float]]:
     """Yield the shapes of each fault, and its prior probability."""
-    blocks, onsets = chain.blocks, _onsets(chain)
-    for piece in _pieces(chain):
-        yield list(_levels(chain, piece)), P_LEVEL
-    yield list(_levels_in_pauses(chain)), P_FAULT
-    yield [each for k in onsets for each in _offsets(chain, k)], P_FAULT
-    scales = list(_scales(chain, soc_pct))
-    for name in ("count_scale", "pack_capacity"):
-        yield [each for each in scales if each.name == name], P_FAULT
-    capacity = chain.sensor("capacity")[0]
-    aged = Column("model_capacity", SCALE_PCT, capacity, capacity, place=("scale",))
-    yield [aged], P_SELDOM
-    volts = chain.sensor("voltage_gain")[1]
-    sensor = Column("voltage_sensor", SENSOR_PCT, place=("voltage_sensor",))
-    yield (
-        [replace(sensor, volts=volts * (blocks.stretch >= k), since=k) for k in onsets],
-        P_SELDOM,
-    )
-    least = LEAST_SLOPE * float(np.ptp(chain.extended.model.pseudo_ocv([5.0, 95.0]))) / 90.0
-    read_pct = blocks.load_v / np.maximum(chain.slope(soc_pct), least)
-    table = Column("voltage_table", 1.0, shown=read_pct, place=("table",), is_positive=True)
-    yield [table], P_FAULT
-    late = Column("late", 1.0, place=("late",), is_positive=True)
-    before_pct = [
-        (seconds, chain.at_blocks(chain.samples.drawn_pct, seconds)) for seconds in LATE_S
-    ]
-    yield (
-        [
-            replace(late, shown=blocks.drawn_pct - before, per_unit=seconds)
-            for seconds, before in before_pct
-        ],
-        P_FAULT,
-    )
+    levels = {n: list(_levels(chain, n)) for n in _pieces(chain)}
+    for shapes in levels.values():
+        yield shapes, FAULTS["start_or_reset"].probability
+    yield [each for n in levels for each in _levels_in_pauses(chain, n)], P_FAULT
+    onsets = _onsets(chain)
+    others = [*_counting(chain, onsets, soc_pct), *_of_voltage(chain, onsets, soc_pct)]
+    for name in dict.fromkeys(each.fault for each in others):
+        yield [each for each in others if each.fault == name], FAULTS[name].probability
+
+
+def _pieces(chain: Chain) -> list[int]:
+    """Return the numbers of the pieces."""
+    return [int(number) for number in np.unique(chain.piece) if number >= 0]
 
 
 def _onsets(chain: Chain) -> list[int]:
@@ -250,110 +245,82 @@ def _onsets(chain: Chain) -> list[int]:
     return [k for k, each in enumerate(chain.stretches) if not each.continues or number - k in back]
 
 
-def _pieces(chain: Chain) -> list[int]:
-    """Return the numbers of the pieces."""
-    return [int(number) for number in np.unique(chain.piece) if number >= 0]
+def _level(shown: BoolArray, piece: int, since: int) -> Column:
+    (std,) = FAULTS["start_or_reset"].stds
+    return Column(std, shown=shown, fault="start_or_reset", since=since, piece=piece)
 
 
 def _levels(chain: Chain, piece: int) -> Iterator[Column]:
     """Yield a wrong level of one piece, of all from it on, and of all up to it."""
     numbers, last = chain.piece, int(chain.piece.max())
     since = int(chain.blocks.stretch[np.argmax(numbers == piece)])
-    spans = {(piece, piece), (piece, last)}
-    if piece < last:
-        spans.add((0, piece))
+    spans = {(piece, piece), (piece, last), (0 if piece < last else piece, piece)}
     for low, high in sorted(spans):
-        yield Column(
-            "start_or_reset",
-            LEVEL_PCT,
-            shown=(numbers >= low) & (numbers <= high),
-            place=("level", piece, since),
-            since=since,
-        )
+        yield _level((numbers >= low) & (numbers <= high), piece, since)
 
 
-def _levels_in_pauses(chain: Chain) -> Iterator[Column]:
+def _levels_in_pauses(chain: Chain, piece: int) -> Iterator[Column]:
     """Yield a level that is wrong from a pause within a piece on, or until it."""
-    blocks = chain.blocks
-    for piece in _pieces(chain):
-        inside = chain.piece == piece
-        first, *later = np.unique(blocks.stretch[inside]).tolist()
-        for pause in later:
-            if chain.stretches[pause].continues:
-                continue
-            is_after = blocks.stretch >= pause
-            for since, shown in ((pause, inside & is_after), (first, inside & ~is_after)):
-                yield Column(
-                    "start_or_reset",
-                    LEVEL_PCT,
-                    shown=shown,
-                    place=("level", piece, since),
-                    since=since,
-                )
+    stretch, inside = chain.blocks.stretch, chain.piece == piece
+    first, *later = np.unique(stretch[inside]).tolist()
+    for pause in later:
+        if not chain.stretches[pause].continues:
+            yield _level(inside & (stretch >= pause), piece, pause)
+            yield _level(inside & (stretch < pause), piece, first)
 
 
-def _begins(chain: Chain) -> tuple[IntArray, IntArray]:
-    """Return the block at which the piece of each block begins: in all, and in its stretch."""
-    blocks = chain.blocks
+def _counting(chain: Chain, onsets: Sequence[int], soc_pct: FloatArray) -> Iterator[Column]:
+    """Yield offsets of the current, wrong scales and capacities, and lags.
+
+    An offset is in the gauge's count alone, or in the log's sensor as well. The error grows while
+    the gauge logs, also while it does not, or within each log alone. A wrong scale is of the count
+    alone, or the pack has another capacity. The gauge is right when a piece begins, when it is
+    full, or when it is empty; or its error is of each log alone.
+    """
+    blocks, model = chain.blocks, chain.model
     in_stretch = blocks.stretch * (chain.piece.max() + 2) + chain.piece
-    found = []
+    begins = []
     for numbers in (chain.piece, in_stretch):
         _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
-        found.append(first[inverse])
-    return found[0], found[1]
-
-
-def _offsets(chain: Chain, since: int) -> Iterator[Column]:
-    """Yield offsets of the current in the gauge's count alone, or in the log's sensor as well.
-
-    The gauge's error grows while it logs, also while it does not, or within each log alone.
-    """
-    blocks, (begin, begin_in_stretch) = chain.blocks, _begins(chain)
+        begins.append(first[inverse])
+    begin, begin_in_stretch = begins
     lasts = [chain.samples.hours[each.samples.stop - 1] for each in chain.stretches]
     logged = blocks.hours + np.concatenate([[0.0], np.cumsum(lasts)])[blocks.stretch]
     stamped = (blocks.time_s - blocks.time_s[0]) / 3600.0
-    first = chain.stretches[since].blocks.start
-    logged, stamped = (np.maximum(clock, clock[first]) for clock in (logged, stamped))
-    per_ah = 100.0 / chain.model.capacity_ah
-    errors = [
-        per_ah * (clock[at] - clock)
-        for clock, at in ((logged, begin), (stamped, begin), (logged, begin_in_stretch))
-    ]
-    names = ("current_offset", "current_offset")
-    for std in OFFSETS_PER_H:
-        one = Column("", std * chain.model.capacity_ah, place=("current_offset",), since=since)
-        yield from _counting(chain, one, "current_offset", names, errors)
+    soc, volts = chain.sensor("current_offset")
+    for since in onsets:
+        is_after = blocks.stretch >= since
+        first = chain.stretches[since].blocks.start
+        clocks = [np.maximum(clock, clock[first]) for clock in (logged, stamped, logged)]
+        for std in FAULTS["current_offset"].stds:
+            for clock, at in zip(clocks, (begin, begin, begin_in_stretch), strict=True):
+                error = 100.0 / model.capacity_ah * (clock[at] - clock)
+                one = Column(std * model.capacity_ah, shown=error, fault="current_offset")
+                one = replace(one, since=since)
+                yield one
+                yield replace(
+                    one, soc=soc * is_after, shown=error + soc * is_after, volts=volts * is_after
+                )
+    soc, volts = chain.sensor("capacity")
+    (std,) = FAULTS["count_scale"].stds
+    for right_pct in (soc_pct[begin], 100.0, 0.0, soc_pct[begin_in_stretch]):
+        error = (soc_pct - right_pct) / 100.0
+        yield Column(std, shown=error, fault="count_scale")
+        yield Column(std, soc, error + soc, volts, fault="pack_capacity")
+    yield Column(std, soc, soc, fault="model_capacity")
+    for late_s in FAULTS["late"].stds:
+        behind_pct = blocks.drawn_pct - chain.drawn_before(late_s)
+        yield Column(late_s, shown=behind_pct / late_s, fault="late")
 
 
-def _scales(chain: Chain, soc_pct: FloatArray) -> Iterator[Column]:
-    """Yield wrong scales: of the gauge's count, or of the pack's capacity.
-
-    The gauge is right when a piece begins, when it is full, or when it is empty; or its error is
-    of each log alone.
-    """
-    begin, begin_in_stretch = _begins(chain)
-    rights_pct = (soc_pct[begin], 100.0, 0.0, soc_pct[begin_in_stretch])
-    errors = [np.asarray(soc_pct - right) / 100.0 for right in rights_pct]
-    names = ("count_scale", "pack_capacity")
-    yield from _counting(chain, Column("", SCALE_PCT, place=("scale",)), "capacity", names, errors)
-
-
-def _counting(
-    chain: Chain,
-    one: Column,
-    effect: str,
-    names: tuple[str, str],
-    errors: Sequence[FloatArray],
-) -> Iterator[Column]:
-    """Yield an effect on the gauge's count alone, and one on sensor or pack as well."""
-    soc, volts = chain.sensor(effect)
-    is_after = chain.blocks.stretch >= one.since
-    for error in errors:
-        yield replace(one, name=names[0], shown=error)
-        yield replace(
-            one,
-            name=names[1],
-            soc=soc * is_after,
-            shown=error + soc * is_after,
-            volts=volts * is_after,
-        )
+def _of_voltage(chain: Chain, onsets: Sequence[int], soc_pct: FloatArray) -> Iterator[Column]:
+    """Yield a wrong voltage of the log, and a gauge that reads a table of voltages under load."""
+    (std,), volts = FAULTS["voltage_sensor"].stds, chain.sensor("voltage_gain")[1]
+    for since in onsets:
+        is_after = chain.blocks.stretch >= since
+        yield Column(std, volts=volts * is_after, fault="voltage_sensor", since=since)
+    (std,) = FAULTS["voltage_table"].stds
+    # Where the curve is flat, a tenth of its mean slope.
+    least = 0.1 * float(np.ptp(chain.extended.model.pseudo_ocv([5.0, 95.0]))) / 90.0
+    read_pct = chain.blocks.load_v / np.maximum(chain.slope(soc_pct), least)
+    yield Column(std, shown=read_pct, fault="voltage_table")

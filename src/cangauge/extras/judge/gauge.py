@@ -8,7 +8,7 @@ still while charge moves. Between two cuts lies a piece.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -20,35 +20,14 @@ COARSE_PCT: Final = 0.2
 LIMIT_PCT: Final = 0.05
 """A published SoC as close to 0 or 100 % is a limit [%]."""
 JUMP_PCT: Final = 1.0
-"""Least jump against the charge [%]: a dashboard shows it."""
-SEVERAL: Final = 4.0
-"""A jump is this many times the change against the charge that one window in ten exceeds."""
-MOST_JUMPS: Final = 4
-"""A gauge that jumps more often in a stretch does not count: its jumps are noise."""
+"""Least jump against the charge [%]: a dashboard shows it. One beyond two steps of y counts."""
+SEVERAL: Final = 4
+"""A jump is this many times the change against the charge that one window in ten exceeds. A gauge
+that jumps more often in a stretch does not count: its jumps are noise."""
 STAND_PCT: Final = 2.0
 """A published SoC stands still where charge moves by this and two of its steps [%]."""
 WINDOW_S: Final = 30.0
 """Windows whose medians are searched for jumps [s]."""
-
-
-class GaugeRecord(NamedTuple):
-    """What a gauge published; arrays of shape (rows,)."""
-
-    shown_pct: FloatArray
-    """y [%]; NaN where there is none."""
-    count_pct: FloatArray
-    """y + Q where y is a count [%]; NaN elsewhere."""
-    is_cut: BoolArray
-    """Whether another piece begins."""
-    held_pct: FloatArray
-    """Charge that moves while y is held [%]; at a limit, away from it."""
-    step_pct: FloatArray
-    """Resolution [%]."""
-
-    @property
-    def stands(self) -> BoolArray:
-        """Whether y stands still."""
-        return self.held_pct >= STAND_PCT + 2.0 * self.step_pct
 
 
 def published_pct(log: Log) -> FloatArray:
@@ -68,7 +47,14 @@ def is_limit(shown_pct: FloatArray | float) -> BoolArray:
     return np.minimum(np.abs(shown_pct), np.abs(np.subtract(shown_pct, 100.0))) <= LIMIT_PCT
 
 
-def read_published(log: Log, drawn_pct: FloatArray, step_pct: float) -> GaugeRecord:
+def stands(held_pct: FloatArray, step_pct: FloatArray, least_pct: float = STAND_PCT) -> BoolArray:
+    """Return whether y stands still, given the charge that moves meanwhile and its resolution."""
+    return held_pct >= least_pct + 2.0 * step_pct
+
+
+def read_published(
+    log: Log, drawn_pct: FloatArray, step_pct: float
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
     """Cut what a gauge published into pieces.
 
     Parameters
@@ -79,22 +65,23 @@ def read_published(log: Log, drawn_pct: FloatArray, step_pct: float) -> GaugeRec
         Q [%].
     step_pct : float
         Resolution of y [%].
+
+    Returns
+    -------
+    shown_pct, count_pct, is_cut, held_pct, step_pct : array of shape (rows,)
+        As in `Samples`.
     """
-    shown = published_pct(log)
-    nothing = np.full_like(shown, np.nan)
-    steps = np.full_like(shown, step_pct)
-    found = GaugeRecord(
-        shown, nothing, np.zeros(len(log), dtype=bool), _held(shown, drawn_pct), steps
-    )
-    is_blank = found.stands | is_limit(shown)
+    shown, steps = published_pct(log), np.full(len(log), step_pct)
+    held, is_cut = _held(shown, drawn_pct), np.zeros(len(log), dtype=bool)
+    is_blank = stands(held, steps) | is_limit(shown)
     count = _counts(np.where(is_blank, np.nan, shown), drawn_pct, step_pct) + drawn_pct
-    found.is_cut[_jumps(log.time_s, count, shown, step_pct)] = True
+    least = max(JUMP_PCT, 2.0 * step_pct)
+    is_cut[_jumps(log.time_s, count, shown, least)] = True
     # A count that goes on after a stand or a limit as it would have without is the same piece.
     for before, after in pairwise(np.flatnonzero(np.isfinite(count))):
         if is_blank[before + 1 : after].any():
-            least = max(JUMP_PCT, 2.0 * step_pct)
-            found.is_cut[after] |= abs(count[after] - count[before]) >= least
-    return found._replace(count_pct=count)
+            is_cut[after] |= abs(count[after] - count[before]) >= least
+    return shown, count, is_cut, held, steps
 
 
 def _held(shown: FloatArray, drawn: FloatArray) -> FloatArray:
@@ -136,7 +123,7 @@ def _counts(shown: FloatArray, drawn: FloatArray, step_pct: float) -> FloatArray
     return used
 
 
-def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, step_pct: float) -> list[int]:
+def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, least: float) -> list[int]:
     """Return the rows at which the count has jumped; the rows within a jump become NaN."""
     known = np.flatnonzero(np.isfinite(count))
     window = np.floor((time_s[known] - time_s[known[:1]]) / WINDOW_S)
@@ -150,9 +137,9 @@ def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, step_pct: f
     # Over two windows, so that a jump of a minute counts whole.
     change = level[2:] - level[:-2]
     usual = float(np.quantile(np.abs(np.diff(level)), 0.9))
-    least = max(JUMP_PCT, 2.0 * step_pct, SEVERAL * usual)
-    is_large = np.minimum(np.abs(change), np.abs(value[2:] - value[:-2])) >= least
-    if np.count_nonzero(is_large[1:] & ~is_large[:-1]) > MOST_JUMPS:
+    sizes = np.minimum(np.abs(change), np.abs(value[2:] - value[:-2]))
+    is_large = sizes >= max(least, SEVERAL * usual)
+    if np.count_nonzero(is_large[1:] & ~is_large[:-1]) > SEVERAL:
         return []
     result, after = list[int](), -1
     for k in np.flatnonzero(is_large).tolist():

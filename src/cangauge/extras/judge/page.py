@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cangauge._text import counted, number
+from cangauge.extras.judge.faults import FAULTS
 from cangauge.extras.judge.result import Judgement
 from cangauge.extras.judge.text import moment, signed
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
@@ -64,7 +65,7 @@ def _fault_table(judgement: Judgement) -> Table:
         [
             fault.name.replace("_", " "),
             number(100.0 * fault.probability, 0),
-            f"{signed(fault.size, 2)} {fault.unit}",
+            f"{signed(fault.size, 2)} {FAULTS[fault.name].unit}",
             f"{signed(fault.interval[0], 2)} … {signed(fault.interval[1], 2)}",
             "before the first log" if fault.since is None else moment(judgement, fault.since),
         ]
@@ -93,7 +94,7 @@ def _figure(judgement: Judgement) -> Figure:
     corrected = [(log.time_s, soc) for log, soc, _ in pieces]
     time.line(figure, "corrected", corrected, BLUE, line_width=2.0)
     time.line(figure, "published", list(published), BLACK, line_width=2.0)
-    for piece in judgement.pieces[1:]:
-        at = float(time.at(piece.begin.log, np.array([piece.begin.time_s]))[0])
+    for (number_of, time_s), *_ in judgement.pieces[1:]:
+        at = float(time.at(number_of, np.array([time_s]))[0])
         figure.mark("height", at, ORANGE, line_dash="dashed", line_width=2)
     return figure

@@ -8,20 +8,15 @@ from typing import Any, Literal, NamedTuple
 
 from cangauge._typing import FloatArray
 from cangauge.extras.judge.explain import Fitted
+from cangauge.extras.judge.faults import FAULTS
 from cangauge.extras.judge.gauge import published_pct
-from cangauge.extras.judge.text import EPOCH_S, lines_of
-from cangauge.extras.judge.weak import WeakestCell
+from cangauge.extras.judge.text import EPOCH_S, SURE, lines_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
 Verdict = Literal["agrees", "off", "cannot_tell"]
-
-
-class Moment(NamedTuple):
-    """A row of a log."""
-
-    log: int
-    time_s: float
+Moment = tuple[int, float]
+"""Number of a log, and a stamp of its rows [s]."""
 
 
 class Piece(NamedTuple):
@@ -42,14 +37,19 @@ class FoundFault(NamedTuple):
     """Something that is wrong."""
 
     name: str
-    """A key of `faults.FAULTS`."""
+    """A key of `faults.FAULTS`, which has its unit."""
     probability: float
     size: float
-    interval: tuple[float, float]
-    """Of 95 %."""
-    unit: str
-    since: Moment | None
+    std: float
+    since: Moment | None = None
     """None: since before the first log."""
+    cell: int | None = None
+    """Number of a weak cell."""
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Of 95 %."""
+        return self.size - SURE * self.std, self.size + SURE * self.std
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +67,11 @@ class Judgement:
         SoC that all logs imply on the gauge's scale, and its σ, at each row of each log [%]; NaN
         where not known.
     verdict : {"agrees", "off", "cannot_tell"}
-    error_pct, error_std_pct : float
-        Published minus corrected SoC at the last published row, and its σ [% SoC].
     pieces : list of Piece
     faults : list of FoundFault
         The most probable first.
-    resets_at_full : bool
+    was_full : bool
         Whether a charge ended full in these logs.
-    weakest : WeakestCell, optional
     """
 
     logs: tuple[Log, ...]
@@ -83,12 +80,19 @@ class Judgement:
     corrected_pct: list[FloatArray]
     corrected_std_pct: list[FloatArray]
     verdict: Verdict
-    error_pct: float
-    error_std_pct: float
     pieces: list[Piece]
     faults: list[FoundFault]
     was_full: bool
-    weakest: WeakestCell | None
+
+    @property
+    def error_pct(self) -> float:
+        """Published minus corrected SoC at the last published row [% SoC]."""
+        return self.pieces[-1].error_pct
+
+    @property
+    def error_std_pct(self) -> float:
+        """Standard deviation of `error_pct` [% SoC]."""
+        return self.pieces[-1].std_pct
 
     @property
     def published_pct(self) -> list[FloatArray]:
@@ -107,10 +111,11 @@ class Judgement:
 
     def since_first_s(self, moment: Moment) -> float:
         """Return the time since the first row of the first log; without dates the logs follow."""
-        own_s = moment.time_s - float(self.logs[moment.log].time_s[0])
+        log, time_s = moment
         if is_dated(self.logs):
-            return moment.time_s - float(self.logs[0].time_s[0])
-        return own_s + sum(log.duration_s for log in self.logs[: moment.log])
+            return time_s - float(self.logs[0].time_s[0])
+        own_s = time_s - float(self.logs[log].time_s[0])
+        return own_s + sum(log.duration_s for log in self.logs[:log])
 
     def to_dict(self, corrected: str | None = None) -> dict[str, Any]:
         """Return the object of `--json`, schema 2."""
@@ -126,8 +131,8 @@ class Judgement:
                 {
                     "from_s": self.since_first_s(piece.begin),
                     "until_s": self.since_first_s(piece.end),
-                    "from_log": self.logs[piece.begin.log].name,
-                    "until_log": self.logs[piece.end.log].name,
+                    "from_log": self.logs[piece.begin[0]].name,
+                    "until_log": self.logs[piece.end[0]].name,
                     "error_pct": piece.error_pct,
                     "sigma_pct": piece.std_pct,
                     "stands_at_pct": piece.stands_at_pct,
@@ -140,7 +145,7 @@ class Judgement:
                     "probability": fault.probability,
                     "size": fault.size,
                     "interval": list(fault.interval),
-                    "unit": fault.unit,
+                    "unit": FAULTS[fault.name].unit,
                     "since_s": None if fault.since is None else self.since_first_s(fault.since),
                 }
                 for fault in self.faults

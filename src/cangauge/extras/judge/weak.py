@@ -12,91 +12,93 @@ a (balance) and r (resistance) are free. The w of the other cells show how well 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, logit
+from scipy.stats import median_abs_deviation
 
 from cangauge._typing import FloatArray
-from cangauge.extras.judge.faults import P_FAULT
+from cangauge.extras.judge.chain import Chain
+from cangauge.extras.judge.faults import FAULTS
+from cangauge.extras.judge.result import FoundFault
+from cangauge.logs.log import Log
+from cangauge.logs.read import CellColumns
+from cangauge.model.voltage_model import hermite_basis
 
-WEAK_STD_PCT: Final = 15.0
-"""Standard deviation of a weak cell's lack of capacity [%]."""
 LEAST_STD_PCT: Final = 1.0
 """Least spread of the capacities of healthy cells [%]: sorted cells of one batch."""
 LEAST_SPAN_PCT: Final = 10.0
 """Least span of SoC over all logs from which capacities are compared [%]."""
-MAD: Final = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
-CURVE_PCT: Final = np.linspace(-20.0, 110.0, 1301)
-"""SoC at which the curve is inverted [%]."""
 
 
-class WeakestCell(NamedTuple):
-    """The weakest cell."""
-
-    number: int
-    """From the number of the first cell."""
-    log_factor: float
-    """ln of the Bayes factor of one weak cell, any of them, against none."""
-    lack_pct: float
-    """Capacity that it lacks [%], and its σ."""
-    std_pct: float
-
-    @property
-    def probability(self) -> float:
-        """Of a weak cell."""
-        return float(expit(self.log_factor + np.log(P_FAULT / (1.0 - P_FAULT))))
-
-    def behind_pct(self, soc_pct: FloatArray) -> FloatArray:
-        """Return by how much the cell is behind a pack that was full [% SoC]."""
-        return self.lack_pct * (100.0 - soc_pct) / (100.0 - self.lack_pct)
-
-
-def weak_cell(
-    volts: Sequence[FloatArray],
-    soc_pct: Sequence[FloatArray],
-    current_a: Sequence[FloatArray],
-    curve_v: FloatArray,
-    first: int = 1,
-) -> WeakestCell | None:
+def weakest_cell(
+    logs: Sequence[Log],
+    cell_voltages: Sequence[CellColumns | None],
+    chain: Chain,
+    soc_pct: FloatArray,
+) -> FoundFault | None:
     """Return the weakest cell; None where the logs do not compare capacities.
 
     Parameters
     ----------
-    volts : sequence of array of shape (n, cells)
-        Cell voltages of each stretch [V].
-    soc_pct, current_a : sequence of array of shape (n,)
-        SoC of the pack [%] and current [A].
-    curve_v : array of shape (1301,)
-        A cell's open-circuit voltage at `CURVE_PCT` [V].
-    first : int
-        Number of the first cell.
+    logs : sequence of Log
+    cell_voltages : sequence of CellColumns
+        Beside each log; None where it has none.
+    chain : Chain
+    soc_pct : array of shape (blocks,)
+        SoC of the pack [%].
     """
-    cells = np.concatenate(volts)
-    S, amps = (np.concatenate(each) for each in (soc_pct, current_a))
-    has = np.isfinite(cells).all(axis=1) & np.isfinite(S)
-    if has.sum() < 4 or cells.shape[1] < 3 or np.ptp(S[has]) < LEAST_SPAN_PCT:
+    volts, socs, amps, first = [], [], [], 1
+    for stretch in chain.stretches:
+        beside = cell_voltages[stretch.log] if stretch.log < len(cell_voltages) else None
+        if beside is not None:
+            log, first = logs[stretch.log], beside.first
+            rows = np.searchsorted(log.time_s, chain.blocks.time_s[stretch.blocks])
+            volts.append(beside.voltage_v[rows])
+            socs.append(soc_pct[stretch.blocks])
+            amps.append(log.current_a[rows])
+    if not volts:
         return None
-    cells, S, amps = cells[has], S[has], amps[has]
-    rising_v = np.maximum.accumulate(curve_v) + 1e-9 * np.arange(curve_v.size)
-    at_v = np.interp(S, CURVE_PCT, rising_v)
-    slope = np.gradient(rising_v, CURVE_PCT)
-    median = np.median(cells, axis=1, keepdims=True)
-    theirs = np.interp(cells - median + at_v[:, None], rising_v, CURVE_PCT)
-    lack = np.empty(cells.shape[1])
-    for k in range(lack.size):  # a voltage says as much of a SoC as the curve is steep
-        steep = np.interp(0.5 * (S + theirs[:, k]), CURVE_PCT, slope)
-        steep[(theirs[:, k] < 0.0) | (theirs[:, k] > 100.0)] = 0.0  # beyond it nobody knows it
-        X = np.column_stack([steep, steep * (S - 100.0) / 100.0, amps * (steep > 0.0)])
-        a = np.linalg.lstsq(X, (theirs[:, k] - S) * steep, rcond=None)[0][1]
-        lack[k] = 100.0 * a / (100.0 + a)
-    lack = lack - np.median(lack)
-    spread = max(LEAST_STD_PCT, MAD * float(np.median(np.abs(lack))))
-    wide = np.hypot(spread, WEAK_STD_PCT)
+    cells, S, current_a = map(np.concatenate, (volts, socs, amps))
+    has = np.isfinite(cells).all(axis=1)
+    cells, S, current_a = cells[has], S[has], current_a[has]
+    if S.size < 4 or cells.shape[1] < 3 or np.ptp(S) < LEAST_SPAN_PCT:
+        return None
+    lack = _lacks_pct(chain, cells, S, current_a)
+    spread = max(LEAST_STD_PCT, float(median_abs_deviation(lack, scale="normal")))
+    kind = FAULTS["weak_cell"]
+    (prior_std,) = kind.stds
+    wide = np.hypot(spread, prior_std)
     factors = 0.5 * lack**2 * (spread**-2 - wide**-2) - np.log(wide / spread)
     factors = np.where(lack > 0.0, factors + np.log(2.0), -np.inf)
-    k = int(np.argmax(lack))
-    gain = WEAK_STD_PCT**2 / (WEAK_STD_PCT**2 + spread**2)
     log_factor = float(np.logaddexp.reduce(factors) - np.log(lack.size))
-    return WeakestCell(first + k, log_factor, gain * float(lack[k]), float(np.sqrt(gain)) * spread)
+    weakest = int(np.argmax(lack))
+    gain = prior_std**2 / (prior_std**2 + spread**2)
+    size = gain * float(lack[weakest])
+    # A capacity is as well known as the slope of the curve over the SoC that was visited.
+    visited_pct = np.array([S.min(), S.max()])
+    of_functions = hermite_basis(visited_pct, chain.functions.soc_pct) @ chain.functions.value
+    over_v = np.diff(chain.extended.model.pseudo_ocv(visited_pct))
+    slope_std = float(np.linalg.norm(np.diff(of_functions, axis=0)) / over_v[0])
+    std = float(np.hypot(np.sqrt(gain) * spread, slope_std * size))
+    probability = float(expit(log_factor + logit(kind.probability)))
+    return FoundFault("weak_cell", probability, size, std, cell=first + weakest)
+
+
+def _lacks_pct(chain: Chain, cells: FloatArray, S: FloatArray, current_a: FloatArray) -> FloatArray:
+    """Return the capacity that each cell lacks beside the median cell [%]."""
+    curve_pct = np.linspace(-20.0, 110.0, 1301)
+    curve_v = chain.extended.model.pseudo_ocv(curve_pct) / cells.shape[1]
+    rising_v = np.maximum.accumulate(curve_v) + 1e-9 * np.arange(curve_v.size)
+    slope = np.gradient(rising_v, curve_pct)
+    apart_v = cells - np.median(cells, axis=1, keepdims=True)
+    theirs = np.interp(apart_v + np.interp(S, curve_pct, rising_v)[:, None], rising_v, curve_pct)
+    lack = np.empty(cells.shape[1])
+    for k in range(lack.size):  # a voltage says as much of a SoC as the curve is steep
+        steep = np.interp(0.5 * (S + theirs[:, k]), curve_pct, slope)
+        steep[(theirs[:, k] < 0.0) | (theirs[:, k] > 100.0)] = 0.0  # beyond it nobody knows it
+        X = np.column_stack([steep, steep * (S - 100.0) / 100.0, current_a * (steep > 0.0)])
+        a = np.linalg.lstsq(X, (theirs[:, k] - S) * steep, rcond=None)[0][1]
+        lack[k] = 100.0 * a / (100.0 + a)
+    return lack - np.median(lack)
