@@ -52,7 +52,7 @@ _SHOWN_ROWS: Final = 20
 """Logs and reasons that are printed; the table has all."""
 
 
-@command()
+@command("dbc", "temperature")
 def fleet_command(
     answer: Annotated[
         Literal["estimate", "gap", "judge"],

@@ -22,7 +22,7 @@ from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
 
-@command("columns", "sign", "temperature")
+@command("dbc", "columns", "sign", "temperature")
 def gap_check_command(
     logs: Annotated[
         list[Path] | None,
