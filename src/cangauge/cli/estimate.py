@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from cangauge._typing import FloatArray
     from cangauge.estimation.offline import EstimateTable
     from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
     from cangauge.service.offline import RecordedEstimate
 
@@ -168,10 +169,71 @@ def estimate_file(
 ) -> RecordedEstimate:
     """Estimate a log or capture as the command does; InputError for what the command refuses."""
     from cangauge.logs.read import LogFile
+    from cangauge.service.offline import estimate_capture, estimate_recorded_log
 
-    is_log = isinstance(reading.open(path), LogFile)
-    estimate = partial(_of_log, soc_from_log=soc_from_log) if is_log else _of_capture
-    return estimate(path, model, settings, reading, keeps_pack=keeps_pack)
+    with progress() as show_line:
+
+        def show(count: int) -> None:
+            show_line(f"{path.name}: {count} rows")
+
+        if not isinstance(reading.open(path), LogFile):
+            car = reading.car_of(path)
+            done = estimate_capture(
+                path, car, model, settings, keeps_pack=keeps_pack, progress=show
+            )
+        else:
+            log = _load(path, model, settings, reading, soc_from_log=soc_from_log)
+            done = estimate_recorded_log(
+                log,
+                model,
+                settings,
+                soc_from_log=soc_from_log,
+                cells=reading.cells_of(log),
+                keeps_pack=keeps_pack,
+                progress=show,
+            )
+    _check(done)
+    return done
+
+
+def _load(
+    path: Path,
+    model: Model,
+    settings: EstimatorSettings,
+    reading: ReadingOptions,
+    *,
+    soc_from_log: bool,
+) -> Log:
+    """Return a log; InputError if its charge contradicts a SoC that it has to start from."""
+    from cangauge.logs.charge import refuse_contradictions
+
+    log, capacity_ah = reading.load(path), settings.capacity_ah or model.capacity_ah
+    if soc_from_log:  # a stated start needs no SoC of the log
+        refuse_contradictions([log], capacity_ah)
+    if settings.initial_soc_pct is not None:
+        note_starts([log], settings.initial_soc_pct, capacity_ah)
+    return log
+
+
+def _check(done: RecordedEstimate) -> None:
+    """Print what to know about a recording; InputError if a capture's current is inverted."""
+    from cangauge.bus.recording import CaptureSamples, refuse_single_row
+    from cangauge.logs.gaps import USUAL_STEPS
+    from cangauge.logs.sign import require_discharge_positive
+    from cangauge.settings import GAP_S
+
+    recorded, gap_s = done.recorded, done.settings.gap_s
+    if isinstance(recorded, CaptureSamples):
+        refuse_single_row(recorded)
+        for text in recorded.remarks:
+            remark(f"{recorded.source}: {text}")
+        if (log := recorded.as_log()) is not None:
+            require_discharge_positive(log, is_capture=True)
+    elif gap_s >= USUAL_STEPS * GAP_S:  # else the usual step is no gap
+        remark(
+            f"note: {recorded.source}: its usual step is {rounded(gap_s / USUAL_STEPS, 2)} s;"
+            f" steps over {rounded(gap_s, 2)} s count as gaps"
+        )
 
 
 def write_estimates(
@@ -193,83 +255,6 @@ def write_estimates(
         file.write((",".join(columns.column_names) + "\n").encode())  # pyarrow would quote them
         options = pacsv.WriteOptions(include_header=False, quoting_style="none")
         pacsv.write_csv(columns, file, options)
-
-
-def _of_log(
-    path: Path,
-    model: Model,
-    settings: EstimatorSettings,
-    reading: ReadingOptions,
-    *,
-    soc_from_log: bool,
-    keeps_pack: bool,
-) -> RecordedEstimate:
-    from cangauge.logs.charge import refuse_contradictions
-    from cangauge.logs.gaps import USUAL_STEPS
-    from cangauge.service.offline import estimate_recorded_log
-    from cangauge.settings import GAP_S
-
-    log = reading.load(path)
-    if soc_from_log:  # a stated start needs no SoC of the log
-        refuse_contradictions([log], settings.capacity_ah or model.capacity_ah)
-    if settings.initial_soc_pct is not None:
-        note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
-    with progress() as show_line:
-
-        def show(count: int) -> None:
-            show_line(f"{log.name}: {count} of {len(log)} samples")
-
-        done = estimate_recorded_log(
-            log,
-            model,
-            settings,
-            soc_from_log=soc_from_log,
-            cells=reading.cells_of(log),
-            keeps_pack=keeps_pack,
-            progress=show,
-        )
-    if (gap_s := done.settings.gap_s) >= USUAL_STEPS * GAP_S:  # else the usual step is no gap
-        remark(
-            f"note: {log.source}: its usual step is {rounded(gap_s / USUAL_STEPS, 2)} s;"
-            f" steps over {rounded(gap_s, 2)} s count as gaps"
-        )
-    return done
-
-
-def _of_capture(
-    path: Path,
-    model: Model,
-    settings: EstimatorSettings,
-    reading: ReadingOptions,
-    *,
-    keeps_pack: bool,
-) -> RecordedEstimate:
-    """Estimate a capture; InputError if it has one sample, or inverted current."""
-    from cangauge.bus.recording import CaptureSamples, refuse_single_row
-    from cangauge.logs.sign import require_discharge_positive
-    from cangauge.service.offline import estimate_capture
-
-    car = reading.car_of(path)
-    with progress() as show_line:
-
-        def show(count: int) -> None:
-            show_line(f"{path.name}: {count} frames")
-
-        done = estimate_capture(
-            path,
-            car,
-            model,
-            settings,
-            keeps_pack=keeps_pack,
-            progress=show,
-        )
-    recorded = done.recorded
-    refuse_single_row(recorded)
-    for text in recorded.remarks:
-        remark(f"{recorded.source}: {text}")
-    if isinstance(recorded, CaptureSamples) and (log := recorded.as_log()) is not None:
-        require_discharge_positive(log, is_capture=True)
-    return done
 
 
 def _show(name: str, found: Mapping[str, Any], table: EstimateTable) -> None:
