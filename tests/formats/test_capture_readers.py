@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import os
 import struct
+import subprocess
+import sys
 import tracemalloc
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
@@ -15,9 +18,8 @@ import can
 import pytest
 from can.io.generic import MessageWriter
 
-from cangauge.bus import readers
 from cangauge.bus.captures import open_capture
-from cangauge.bus.readers import CandumpLogReader, CaptureReader, LineReader, capture_readers
+from cangauge.bus.readers import CandumpLogReader, CaptureReader
 from cangauge.errors import InputError
 from cangauge.extras.formats import pcap, text
 from cangauge.extras.formats import python_can as library
@@ -530,40 +532,48 @@ def test_python_can_finds_our_readers(tmp_path: Path, suffix: str) -> None:
             assert made.facts(reader) == made.facts(frames_of())
 
 
-def test_other_packages_add_readers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    class Entry:
-        name, value = "mine", "mine:MyReader"
+READER = """
+import can
 
-        def load(self) -> type:
-            return MyReader
-
-    monkeypatch.setattr(readers, "entry_points", lambda **_: [Entry()])
-    capture_readers.cache_clear()
-    try:
-        path = tmp_path / "mine"
-        path.write_text("MINE\n1.5 291 aabb\n2.5 292 cc\n")
-        capture = open_capture(path)
-        assert [(f.timestamp, f.arbitration_id) for f in capture] == [(1.5, 291), (2.5, 292)]
-        assert capture.info["format"] == "my format"
-    finally:
-        capture_readers.cache_clear()
+from cangauge.bus.readers import LineReader
 
 
 class MyReader(LineReader):
-    """As another package would write it."""
-
     name = "my format"
 
-    def prepare(self, head: Sequence[str]) -> bool:
+    def prepare(self, head):
         return head[0].startswith("MINE")
 
-    def parse(self, line: str) -> can.Message | None:
+    def parse(self, line):
         if line.startswith("MINE"):
             return None
         time, number, data = line.split()
-        return can.Message(
-            timestamp=float(time), arbitration_id=int(number), data=bytes.fromhex(data)
-        )
+        data = bytes.fromhex(data)
+        return can.Message(timestamp=float(time), arbitration_id=int(number), data=data)
+"""
+READ = """
+from pathlib import Path
+
+from cangauge.bus.captures import open_capture
+
+capture = open_capture(Path("mine"))
+print([(f.timestamp, f.arbitration_id) for f in capture], capture.info["format"])
+"""
+
+
+def test_other_packages_add_readers(tmp_path: Path) -> None:
+    (tmp_path / "mypackage.py").write_text(READER)
+    package = tmp_path / "mypackage-1.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Name: mypackage\nVersion: 1\n")
+    entry = "[cangauge.capture_readers]\nmine = mypackage:MyReader\n"
+    (package / "entry_points.txt").write_text(entry)
+    (tmp_path / "mine").write_text("MINE\n1.5 291 aabb\n2.5 292 cc\n")
+    done = subprocess.run(
+        [sys.executable, "-c", READ], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "[(1.5, 291), (2.5, 292)] my format\n"
 
 
 def test_pcap_of_a_network_names_the_cure(tmp_path: Path) -> None:

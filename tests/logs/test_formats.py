@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import datetime as dt
 import gzip
+import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -220,35 +223,42 @@ def test_mf4_signals_of_several_rasters_become_a_log(tmp_path: Path) -> None:
 # ---- a reader of another package
 
 
-def test_reader_of_another_package_is_offered_files_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from cangauge.logs import read  # noqa: PLC0415
-    from cangauge.logs.draft import DraftLog  # noqa: PLC0415
+READER = """
+import numpy as np
 
-    class MyLogger:
-        name = "my logger"
-        takes_columns = False
+from cangauge.logs.draft import DraftLog
 
-        def matches(self, head: Any) -> bool:
-            return bool(head.first_line.startswith("MYLOGGER"))
 
-        def read(self, head: Any, _columns: object = None, /) -> DraftLog:
-            rows = [line.split() for line in head.read().decode().splitlines()[1:]]
-            time_s, current_a, voltage_v = np.array(rows, dtype=float).T
-            values = {"time_s": time_s, "current_a": current_a, "voltage_v": voltage_v}
-            return DraftLog(head.name, str(head.path), values)
+class MyLogger:
+    name = "my logger"
+    takes_columns = False
 
-    class EntryPoint:
-        def load(self) -> type[MyLogger]:
-            return MyLogger
+    def matches(self, head):
+        return head.first_line.startswith("MYLOGGER")
 
-    monkeypatch.setattr(read, "entry_points", lambda group: [EntryPoint()] * (group == read.GROUP))
-    monkeypatch.setattr(read, "_readers", read._readers.__wrapped__)
+    def read(self, head, _columns=None, /):
+        rows = [line.split() for line in head.read().decode().splitlines()[1:]]
+        names = "time_s", "current_a", "voltage_v"
+        return DraftLog(head.name, str(head.path), dict(zip(names, np.array(rows, float).T)))
+"""
+
+
+def test_other_packages_add_readers(tmp_path: Path) -> None:
+    (tmp_path / "mypackage.py").write_text(READER)
+    package = tmp_path / "mypackage-1.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Name: mypackage\nVersion: 1\n")
+    (package / "entry_points.txt").write_text("[cangauge.readers]\nmine = mypackage:MyLogger\n")
     rows = (f"{t} {i} {u}\n" for t, i, u in zip(TIME_S, CURRENT_A, VOLTAGE_V, strict=True))
     (tmp_path / "mine.txt").write_text("MYLOGGER 1\n" + "".join(rows))
-    log = read_log(tmp_path / "mine.txt", temperature_c=20.0)
-    np.testing.assert_array_equal(log.current_a, CURRENT_A)
+    read = (
+        "import cangauge; print(cangauge.read_log('mine.txt', temperature_c=20).current_a.tolist())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", read], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    np.testing.assert_array_equal(json.loads(done.stdout), CURRENT_A)
 
 
 def test_influxdb_repeats_its_header_above_each_table(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.gaps import bridge_s, discharged_ah, split_where_moved
 from cangauge.logs.log import Log
+from cangauge.logs.quantities import QUANTITIES
 
 MIN_SPAN_PCT: Final = 5.0
 """Least span of the reference SoC for a capacity [%]: below, its quantization dominates."""
@@ -30,9 +31,6 @@ SURE: Final = 3.0
 """Standard deviations by which a contradiction exceeds the error by sampling [-]."""
 COUNTER_SHARE: Final = 0.02
 """Difference of a counter from the charge of the current, by two sensors' gains [-]."""
-DAY_S: Final = 86400.0
-"""Longest time over which charge is compared with a SoC [s]: a battery at home makes a cycle in it,
-and 0.1 A of offset move 2.4 Ah."""
 JUMP_PCT: Final = 3.0
 """Least step of a SoC that its gauge corrected [%]: no dashboard shows coarser steps …"""
 USUAL_STEPS: Final = 5.0
@@ -214,9 +212,9 @@ def _implied(counts: Sequence[_Count]) -> ImpliedCapacity | None:
 def _counts(log: Log, least_pct: float, *, at_ends: bool = True) -> Iterator[_Count]:
     """Yield the counts of a log over which the SoC moves by `least_pct` or more [%].
 
-    Each is of a day at most, if the SoC moves so far in one: over weeks an offset moves more charge
-    than the pack holds. Without `at_ends` charge that moves while the SoC stands at 0 or 100 % is
-    left out: a gauge that is off stands there.
+    Each is of a day at most, if the SoC moves so far in one: a battery at home makes a cycle in it.
+    Over weeks an offset moves more charge than the pack holds. Without `at_ends` charge that moves
+    while the SoC stands at 0 or 100 % is left out: a gauge that is off stands there.
     """
     for piece in split_where_moved(log):
         soc_pct = np.full(len(piece), np.nan) if piece.soc_pct is None else piece.soc_pct
@@ -236,7 +234,8 @@ def _counts(log: Log, least_pct: float, *, at_ends: bool = True) -> Iterator[_Co
             out_ah = np.cumsum(np.where(is_end & (steps == 0.0), 0.0, np.diff(out_ah)))
             out_ah = np.concatenate([[0.0], out_ah])
         whole = _Count(known_pct, out_ah, std_ah, step_pct)
-        days = np.unique((piece.time_s[rows] - piece.time_s[0]) // DAY_S, return_index=True)[1]
+        day_s, _ = QUANTITIES["time"].units["d"]
+        days = np.unique((piece.time_s[rows] - piece.time_s[0]) // day_s, return_index=True)[1]
         parts = [whole.part(*ends) for ends in pairwise([*days.tolist(), len(known_pct)])]
         moved = [part for part in parts if part.span_pct >= least_pct]
         if len(parts) > 1 and moved:

@@ -92,7 +92,7 @@ CURRENT_FIELDS: Final = _TABLE["fields"]
 """Widths [bit] and steps [A] of a current's field on a bus, the usual ones first."""
 FIELDS: Final = {name: quantity.field for name, quantity in QUANTITIES.items()}
 """Canonical column by the name that users write."""
-REQUIRED: Final = tuple(FIELDS.values())[:4]
+REQUIRED: Final = tuple(field for name, field in FIELDS.items() if name != "soc")
 """Columns of every log."""
 _BY_FIELD: Final = {quantity.field: quantity for quantity in QUANTITIES.values()}
 

@@ -24,11 +24,10 @@ from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
+from cangauge.logs.quantities import LIMITS
 
 STEP_SPACING_S: Final = 1.0
 """Time between the rows whose difference is a step [s]."""
-_STEP_LIMIT_S: Final = 90.0
-"""Longest interval of a step [s]: the slowest logging of cyclers is 60 s."""
 _STEP_SHARE: Final = 0.05
 """Smallest step, relative to the range of current [-]."""
 _MAX_STEPS: Final = 400
@@ -119,7 +118,7 @@ def current_steps(log: Log) -> tuple[FloatArray, FloatArray]:
     """Return the clear steps, at most 400 of the largest: changes of current [A], voltage [V]."""
     rows = spaced_rows(log.time_s, STEP_SPACING_S)
     change = np.diff(log.current_a[rows])
-    near = np.diff(log.time_s[rows]) <= _STEP_LIMIT_S
+    near = np.diff(log.time_s[rows]) <= LIMITS["interval_s"]
     clear = np.abs(change) >= _STEP_SHARE * np.ptp(log.current_a)
     chosen = np.flatnonzero(near & clear & (change != 0.0))
     if chosen.size > _MAX_STEPS:

@@ -57,8 +57,7 @@ _STATES: Final = re.compile(
 _CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])|充"
 _DISCHARGES: Final = r"(?:^|[^a-z])(?:d|dis[a-z]*|dch[a-z]*)(?:$|[^a-z])|放"
 _LEAF_SPY: Final = {"Gids", "AHr", "Pack Volts"}
-_LEAF_SPY_SOC: Final = 1e-4
-"""LeafSpy writes SoC in ten-thousandths of a percent."""
+"""Columns of a LeafSpy log, whose SoC is in ten-thousandths of a percent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +186,7 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
             unit, shown = "0-1", "0–1, from its range"
         elif _LEAF_SPY.issubset(draft.headings) and np.nanmedian(finite) > 110.0:
             draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
-            parts = [parts[0] * _LEAF_SPY_SOC]
+            unit = "0.0001%"
     parts = [convert(part, name, unit, source=where, label=draft.labels[name]) for part in parts]
     if quantity == "temperature":
         draft.take_probes(headings, parts)
