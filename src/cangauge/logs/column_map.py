@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from cangauge.errors import InputError
 from cangauge.logs.quantities import FIELDS
@@ -87,28 +87,22 @@ def _items(given: Mapping[str, str] | str, where: str) -> Iterable[tuple[str, An
     return items
 
 
-class StatedColumn(NamedTuple):
-    """A column as a user states it: heading, unit (None: as the heading says) and factor."""
+def meant_by(text: str) -> list[tuple[str, str | None, float]]:
+    """Return what a text may mean: heading, unit (None: as the heading says) and factor.
 
-    heading: str
-    unit: str | None
-    factor: float
-
-
-def meant_by(text: str) -> list[StatedColumn]:
-    """Return what a text may mean: a heading as a whole, less a factor, less a unit.
+    The heading as a whole is first, then less a factor, then less a unit.
 
     Examples
     --------
-    >>> [tuple(each) for each in meant_by("I [A]")]
+    >>> meant_by("I [A]")
     [('I [A]', None, 1.0), ('I', 'A', 1.0)]
     """
-    meant = [StatedColumn(text, None, 1.0)]
+    meant: list[tuple[str, str | None, float]] = [(text, None, 1.0)]
     with_factor = _FACTOR.match(text)
     if with_factor:
-        meant.append(StatedColumn(with_factor["text"], None, float(with_factor["factor"])))
+        meant.append((with_factor["text"], None, float(with_factor["factor"])))
     for heading, _, factor in list(meant):
         with_unit = _UNIT.match(heading)
         if with_unit:
-            meant.append(StatedColumn(with_unit["text"], with_unit["unit"].strip(), factor))
+            meant.append((with_unit["text"], with_unit["unit"].strip(), factor))
     return meant

@@ -177,7 +177,9 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
             cure = f"state the right one: --columns '{quantity}=HEADING[UNIT]'"
             raise draft.error(name, problem, cure, f"{in_cells}, heading {unit}")
         unit = unit or in_cells
-    parts = [numbers * column.factor for numbers, _ in read]
+    parts = [numbers for numbers, _ in read]
+    if column.factor != 1.0:
+        parts = [numbers * column.factor for numbers in parts]
     shown = unit or f"{QUANTITIES[quantity].unit}, assumed"
     if quantity == "soc":
         finite = parts[0][np.isfinite(parts[0])]

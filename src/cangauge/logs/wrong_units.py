@@ -57,17 +57,19 @@ def refuse_wrong_units(
     """
     current, voltage = values["current_a"], values["voltage_v"]
     temperature = values["temperature_c"]
+    typical_v, typical_c = float(np.median(voltage)), float(np.median(temperature))
+    is_low = COLDEST_C <= typical_v <= LIMITS["unusually_hot_c"]  # as a temperature
+    is_constant = is_low and bool(np.ptp(temperature) == 0.0)  # a code
     voltage_label = labels.get("voltage_v", "voltage_v")
-    is_low = bool(COLDEST_C <= np.median(voltage) <= LIMITS["unusually_hot_c"])  # as a temperature
     checks = (
         ("current_a", _wrapped(current, voltage)),
         ("time_s", _wrong_time(values, in_seconds=in_seconds)),
         # Before the voltage: a temperature in its place looks like kilovolts.
-        ("temperature_c", _swapped(temperature, voltage_label) if is_low else ()),
-        ("voltage_v", _wrong_voltage(voltage)),
+        ("temperature_c", _swapped(typical_c, voltage_label) if is_low and not is_constant else ()),
+        ("voltage_v", _wrong_voltage(voltage, typical_v)),
         ("current_a", _wrong_current(current)),
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
-        ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
+        ("temperature_c", _wrong_temperature(temperature, typical_c, may_be_swapped=is_low)),
     )
     wrong: dict[str, _Wrong] = {}
     for field, found in checks:
@@ -89,9 +91,8 @@ def refuse_wrong_units(
         raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
     option = _option({"temperature_c": (labels.get("temperature_c", "temperature_c"), ["°F"])})
     doubt = "" if "temperature_c" in stated else f": if it is °F, state the unit: {option}"
-    typical = float(np.median(temperature))
-    remark = f"temperature {typical:.0f} °C is unusually hot{doubt}"
-    return (remark,) if typical > LIMITS["unusually_hot_c"] else ()
+    remark = f"temperature {typical_c:.0f} °C is unusually hot{doubt}"
+    return (remark,) if typical_c > LIMITS["unusually_hot_c"] else ()
 
 
 def _option(columns: dict[str, tuple[str, list[str]]]) -> str:
@@ -191,8 +192,7 @@ def _c_rate(values: dict[str, FloatArray]) -> float:
     return rms_a * np.ptp(soc) / 100.0 / charge_ah if charge_ah else math.nan
 
 
-def _wrong_voltage(voltage: FloatArray) -> Iterator[_Wrong]:
-    typical = float(np.median(voltage))
+def _wrong_voltage(voltage: FloatArray, typical: float) -> Iterator[_Wrong]:
     if typical > LIMITS["voltage_v"]:
         yield _in_finer_unit(typical, LIMITS["voltage_v"], "volts", "voltage")
     if typical <= 0.0:
@@ -242,16 +242,15 @@ def _wrong_soc(soc: FloatArray | None, *, is_stated: bool) -> Iterator[_Wrong]:
         yield odd, f"SoC of row {row + 1} is not within 0–100 %", "convert it to %", []
 
 
-def _swapped(temperature: FloatArray, label: str) -> Iterator[_Wrong]:
-    typical = float(np.median(temperature))
-    is_high = 273.15 + LIMITS["unusually_hot_c"] < typical <= LIMITS["voltage_v"]
-    if is_high and np.ptp(temperature) > 0.0:  # a constant is a code
+def _swapped(typical: float, label: str) -> Iterator[_Wrong]:
+    if 273.15 + LIMITS["unusually_hot_c"] < typical <= LIMITS["voltage_v"]:
         problem = f"it looks like a pack's voltage, and {label} like a temperature"
         yield typical, problem, "the two columns (or signals) look swapped: exchange them", []
 
 
-def _wrong_temperature(temperature: FloatArray, *, may_be_swapped: bool) -> Iterator[_Wrong]:
-    typical = float(np.median(temperature))
+def _wrong_temperature(
+    temperature: FloatArray, typical: float, *, may_be_swapped: bool
+) -> Iterator[_Wrong]:
     if 200.0 <= typical <= 400.0:
         also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
         units = ["K"] if np.any(temperature % 1.0) else ["K", "0.1°C"]
