@@ -186,9 +186,7 @@ MODULE = {
 }
 
 
-def test_a_low_voltage_modules_scale_is_among_the_levels_or_stated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_low_voltage_modules_scale_is_among_the_levels_or_stated() -> None:
     frames = (Frame(0x618, 0.1, 8, MODULE), Frame(0x300, 0.01, 8, {"speed": Bits(0, 8, True, 1.0)}))
     module = Car("module", frames, *((0x618, MODULE[each]) for each in ("current", "voltage")),
                  volts=52.0, ohm=0.01)  # fmt: skip
@@ -199,6 +197,5 @@ def test_a_low_voltage_modules_scale_is_among_the_levels_or_stated(
     assert "voltage" in stated.clear
     assert "current" in stated.clear
     # Of a long capture all ids are looked at over one time, which is said.
-    monkeypatch.setattr("cangauge.extras.discovery.search.MOST_FRAMES", 3300)
-    part = search(capture(module), nominal_v=52.0)
+    part = search(capture(module), nominal_v=52.0, at_most=3300)
     assert part.remarks[-1] == "ranges and steps are those of the first 30 s"

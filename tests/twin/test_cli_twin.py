@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import doctest
 import json
 from pathlib import Path
@@ -105,11 +106,9 @@ def test_full_discharge_gives_its_capacity() -> None:
         (("-o", "nowhere/x.csv"), "folder"),
     ],
 )
-def test_bad_usage_is_refused(
-    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, list(arguments))
+def test_bad_usage_is_refused(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    with contextlib.chdir(tmp_path):
+        result = CliRunner().invoke(app, list(arguments))
     assert isinstance(result.exception, InputError)
     assert message in str(result.exception)
     assert not list(tmp_path.iterdir())

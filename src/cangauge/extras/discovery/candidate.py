@@ -12,12 +12,6 @@ MOST_A: Final = 1500.0
 """Largest current of a pack [A]: the fastest cars draw 1,500 A."""
 LEAST_HOURS: Final = 1.0 / 20.0
 """Least capacity by the largest current [h]: no car is driven at more than 20 C."""
-MOST_SAG: Final = 0.2
-"""Largest share of its voltage by which a pack sags: inverters switch off below."""
-CAPACITY_AH: Final = (2.0, 600.0)
-"""Capacities of packs [Ah]: of a scooter to that of a truck."""
-LARGEST_RATIO: Final = 2.0
-"""Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
 SHOWN: Final = 3
 """Candidates of a role that are shown."""
 
@@ -150,8 +144,8 @@ class Candidate:
 
     @property
     def is_repeated(self) -> bool:
-        """Whether both halves of the capture show alike resistances."""
-        return max(self.halves_ohm) <= LARGEST_RATIO * min(self.halves_ohm)
+        """Whether both halves of the capture show alike resistances: a coincidence does not."""
+        return max(self.halves_ohm) <= 2.0 * min(self.halves_ohm)
 
     @property
     def facts(self) -> str:
@@ -226,6 +220,5 @@ def range_text(low: float, high: float, unit: str, sign: int = 1) -> str:
 
 
 def is_capacity(capacity_ah: float) -> bool:
-    """Return whether a pack may have this capacity."""
-    least_ah, most_ah = CAPACITY_AH
-    return least_ah < capacity_ah < most_ah
+    """Return whether a pack may have this capacity: from a scooter's to a truck's."""
+    return 2.0 < capacity_ah < 600.0

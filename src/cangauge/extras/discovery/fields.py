@@ -31,12 +31,8 @@ MIN_FRAMES: Final = 12
 STEADY: Final = 0.55
 """Least share of equal steps of an alive counter. A capture that loses a quarter of its frames
 still has 0.75."""
-MOST_VALUES: Final = 32
-"""Most values of a multiplexer."""
 MULTIPLEXED: Final = 0.4
 """Largest ratio of the changes among frames of one multiplexer value to those of all frames."""
-LARGEST_ODDS: Final = 3.0
-"""Largest log odds of a byte order [nats]: modules of several suppliers share a bus."""
 LINK_EVENTS: Final = 4
 """Fewest carries from which a cut is judged."""
 NATURAL: Final = -2.0
@@ -159,35 +155,21 @@ class Field:
         return max(self.extents, key=attrgetter("nature"))
 
     @cached_property
-    def statistics(self) -> Statistics:
-        """Of its numbers where they are available."""
-        return Statistics.of(self.raw[~self.missing])
+    def values(self) -> Ints:
+        """Its numbers where they are available."""
+        return self.raw[~self.missing]
 
-
-class Statistics(NamedTuple):
-    """Range and number of a field's distinct values, the most common one, and a log prior.
-
-    The prior is that a measurement moves so [nats].
-    """
-
-    low: float
-    high: float
-    distinct: int
-    resting: float
-    prior: float
-
-    @classmethod
-    def of(cls, raw: Ints) -> Statistics:
-        """Return those of raw numbers in time."""
-        values, change = np.unique(raw), np.diff(raw)
-        count, low, high = len(values), float(values[0]), float(values[-1])
-        filled = count / min(high - low + 1.0, len(raw) / 4.0 + 1.0)
+    @cached_property
+    def prior(self) -> float:
+        """Log prior that a measurement moves so [nats]."""
+        values, change = np.unique(self.values), np.diff(self.values)
+        count = len(values)
+        filled = count / min(float(np.ptp(values)) + 1.0, len(self.values) / 4.0 + 1.0)
         rises, falls = np.count_nonzero(change > 0), np.count_nonzero(change < 0)
         # A measurement moves up and down through neighbouring values; states jump between few.
         is_moving = rises + falls >= 8 and min(rises, falls) > 2
         prior = 1.5 if is_moving and count >= 3 and filled > 0.5 else 0.0
-        prior -= 2.0 if count < 3 else 1.5 if filled < 0.2 else 0.0
-        return cls(low, high, count, most_common(raw), prior)
+        return prior - (2.0 if count < 3 else 1.5 if filled < 0.2 else 0.0)
 
 
 def most_common(values: Ints) -> float:
@@ -236,7 +218,7 @@ def _demultiplexed(stream: Stream) -> list[Stream]:
                 continue
             codes = _codes(bits, first, width)
             values, counts = np.unique(codes, return_counts=True)
-            if not 2 <= len(values) <= MOST_VALUES or counts.min() < MIN_FRAMES:
+            if not 2 <= len(values) <= 32 or counts.min() < MIN_FRAMES:
                 continue
             if np.count_nonzero(np.diff(codes)) < 0.5 * len(codes):
                 continue
@@ -438,7 +420,7 @@ def _byte_order(orders: Iterable[Sequence[_Order]]) -> float:
         if motorola != intel:
             votes[intel > motorola] += 1
     odds = math.log((votes[0] + 1.0) / (votes[1] + 1.0))
-    return max(-LARGEST_ODDS, min(LARGEST_ODDS, odds))
+    return max(-3.0, min(3.0, odds))  # modules of several suppliers share a bus
 
 
 def _extents(order: _Order, other: _Order, odds: float) -> Iterator[tuple[int, list[Extent]]]:

@@ -20,7 +20,6 @@ from scipy.signal import lfilter
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.discovery.candidate import (
     MOST_A,
-    MOST_SAG,
     ROLES,
     SHOWN,
     Candidate,
@@ -40,14 +39,8 @@ CURRENT_SCALES: Final = {
     0.02: -1.5,
 }
 """Usual scales [A] and their log priors [nats], by their frequency in public DBC files."""
-MOST_ROWS: Final = 4000
-TREND_S: Final = 10.0
-"""Width of the moving average that is taken away [s]: shorter than SoC and temperature move."""
 MOVE_S: Final = 0.5
 """Time of one move [s]: the load of a car changes no faster."""
-MOST_MOVES: Final = 60.0
-"""Independent moves from which on a chance is excluded: two minutes of driving have as many, and
-the noise of a sensor that is sent twice has more."""
 LARGEST_R2: Final = 0.97
 """Polarisation within seconds leaves some of a voltage's variance without the current: a closer
 relation is no further evidence of a pack."""
@@ -55,33 +48,11 @@ FEW_MOVES: Final = 4.0
 """Fewer independent moves than this may be one coincidence, such as the wake-up of all nodes."""
 ALIKE: Final = 3.5
 """Largest ratio of the steps of two copies: one has at most a bit or two more."""
-MANY_MOVES: Final = 20.0
-"""With more independent moves than this, a voltage shows its polarisation: what follows a current
-closer than COPY_R2 is the same quantity."""
-COPY_R2: Final = 0.9985
-ROUNDING: Final = 0.15
-"""Variance by which two roundings of one number differ, by the sum of their steps squared: a sixth
-of a step squared on average, a quarter where they are half a step apart."""
-RESISTANCE_OHM: Final = (0.008, 1.2)
-TYPICAL_OHM: Final = 0.12
-RESISTANCE_SPREAD: Final = 1.2
-"""Bounds, median and log spread of a pack's resistance: 12 V starter packs to old car packs."""
-SATURATION_NATS: Final = 20.0
-"""Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
 """Largest relative difference of two voltages of one frame that are those of two cells."""
 POLARISATION_S: Final = 3.0
 """Time constant with which a sustained current is seen [s]: the diffusion of lithium-ion cells
 shows from seconds on, and slower parts are taken away as a trend."""
-POLARISATION: Final = (0.1, 0.2, 0.4, 0.8)
-"""Ratios of the resistance that grows within that time to the ohmic one: a cell's 10-s resistance
-is 1.2 to 2 times that of the first 0.1 s."""
-TRUSTED_NATS: Final = 10.0
-SHOWN_NATS: Final = 5.0
-"""Most that this test counts against a pair, as its model is not exact, and for one: cells sag as
-the pack does, and finer numbers show it better."""
-SAME_FRAME_NATS: Final = 4.0
-"""Log prior of a pair in one frame: 5 of 7 public layouts, against one of a car's dozens of ids."""
 IMPOSSIBLE: Final = -99.0
 
 
@@ -91,14 +62,13 @@ class Grid:
     Parameters
     ----------
     streams : sequence of Stream
-    step_s : float
-        Shortest slot [s].
+        Pack messages come every 10–100 ms: a slot has 0.1 s, or more beyond 4000 slots.
     """
 
-    def __init__(self, streams: Sequence[Stream], step_s: float) -> None:
+    def __init__(self, streams: Sequence[Stream]) -> None:
         start_s = min(float(each.time_s[0]) for each in streams)
         self.duration_s = max(float(each.time_s[-1]) for each in streams) - start_s
-        self.step_s = max(step_s, self.duration_s / MOST_ROWS)
+        self.step_s = max(0.1, self.duration_s / 4000)
         self._rows = max(int(self.duration_s / self.step_s), 4)
         edges = start_s + self.step_s * np.arange(self._rows + 1)
         self._slots = {
@@ -246,7 +216,8 @@ class _Moves:
 
     @classmethod
     def of(cls, grid: FloatArray, step_s: float) -> _Moves:
-        width = max(3, min(int(TREND_S / step_s), grid.shape[1] // 2))
+        # The trend over 10 s: SoC and temperature move more slowly.
+        width = max(3, min(int(10.0 / step_s), grid.shape[1] // 2))
         padded = np.pad(grid, ((0, 0), (width // 2 + 1, width - width // 2 - 1)), mode="edge")
         sums = np.cumsum(padded, axis=1)
         free = grid - (sums[:, width:] - sums[:, :-width]) / width
@@ -260,7 +231,9 @@ class _Moves:
         both = np.sqrt(steps * _participation(_grouped(free, group)))
         values = (free / np.maximum(std, 1e-12)[:, None]).astype(np.float32)
         memory = (values[:, group:] * values[:, :-group]).mean(1, dtype=np.float64)
-        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), MOST_MOVES), memory)
+        # From 60 on a chance is excluded: two minutes of driving have as many, and the noise of a
+        # sensor that is sent twice has more.
+        return cls(values, std, np.minimum(np.where(steps < 3.0, steps, both), 60.0), memory)
 
 
 def _grouped(rows: FloatArray, group: int) -> FloatArray:
@@ -307,20 +280,22 @@ class Pairs:
         likely = np.where(unknown, -1.0, np.maximum(likely, -3.0))
         self.current_scale = np.where(unknown, _guess(widths, away), self.current_scale)
         middle = [np.median(each, axis=1) for each in level]
-        sags = self.slope * away > MOST_SAG * middle[0][:, None]
+        # Inverters switch off a pack that sags by more than a fifth.
+        sags = self.slope * away > 0.2 * middle[0][:, None]
         is_copy = (np.abs(self.slope * middle[1] / middle[0][:, None] - 1.0) < 0.25) & (
             self.r > 0.5
         )
         ids = [np.array([id(row.field.stream) for row in each]) for each in (voltages, currents)]
-        # Correlated loads (torque, power) are no independent samples: evidence saturates.
-        self.evidence = SATURATION_NATS * np.log1p(evidence / SATURATION_NATS)
+        # Correlated loads (torque, power) are no independent samples: from 20 nats on they count half.
+        self.evidence = 20.0 * np.log1p(evidence / 20.0)
         self.score = (
             self.evidence
             + self._polarisation(level[1])
             + np.array([row.prior for row in voltages])[:, None]
             + np.array([row.prior for row in currents])
             + likely
-            + np.where(ids[0][:, None] == ids[1], SAME_FRAME_NATS, 0.0)
+            # One frame holds both in 5 of 7 public layouts, against one of a car's dozens of ids.
+            + 4.0 * (ids[0][:, None] == ids[1])
             + np.where(is_copy | (sags & ~unknown), IMPOSSIBLE, 0.0)
             - 1.5 * self._has_sibling(middle[0])[:, None]
         )
@@ -357,8 +332,11 @@ class Pairs:
         u_step = np.array([row.step for row in self._voltages])[:, None]
         i_step = self.slope * np.array([row.step for row in self._currents])
         alike = (i_step > u_step / ALIKE) & (i_step < u_step * ALIKE)
-        rounded = alike & (lost < ROUNDING * (u_step**2 + i_step**2))
-        return np.asarray(rounded | ((self.r**2 > COPY_R2) & (count > MANY_MOVES)))
+        # Two roundings of one number differ by a sixth of a step squared on average, by a quarter
+        # where they are half a step apart.
+        rounded = alike & (lost < 0.15 * (u_step**2 + i_step**2))
+        # In many moves a voltage shows its polarisation: what follows closer is the same quantity.
+        return np.asarray(rounded | ((self.r**2 > 0.9985) & (count > 20.0)))
 
     def _polarisation(self, current: FloatArray) -> FloatArray:
         """Return the evidence that the voltage sags on under a sustained current.
@@ -374,13 +352,15 @@ class Pairs:
         own = (self._i.values * low.values).mean(1, dtype=np.float64)
         spread = low.std / np.maximum(self._i.std, 1e-9)
         best = np.full(self.r.shape, -np.inf)
-        for ratio in POLARISATION:
+        # A cell's 10-s resistance is 1.2 to 2 times that of the first 0.1 s.
+        for ratio in (0.1, 0.2, 0.4, 0.8):
             share = ratio * spread
             r = (self.r + share * with_past) / np.sqrt(1.0 + 2.0 * share * own + share**2)
             best = np.maximum(best, r**2)
         count = self._rows * self._step_s / POLARISATION_S
         left = np.maximum(1.0 - best, 1e-6) / np.maximum(1.0 - self.r**2, 1e-6)
-        return np.asarray(np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, SHOWN_NATS))
+        # Bounded: the model is not exact, and cells sag as the pack does, in finer numbers.
+        return np.asarray(np.clip(-0.5 * count * np.log(left), -10.0, 5.0))
 
     def _has_sibling(self, level: FloatArray) -> BoolArray:
         """Return which voltages are one of two in a frame: lowest and highest cell."""
@@ -503,6 +483,6 @@ def _correlation(one: FloatArray, two: FloatArray) -> FloatArray:
 
 
 def _resistance_prior(ohm: FloatArray) -> FloatArray:
-    low, high = RESISTANCE_OHM
-    distance = np.log(np.maximum(ohm, 1e-12) / TYPICAL_OHM) / RESISTANCE_SPREAD
-    return np.asarray(np.where((ohm < low) | (ohm > high), IMPOSSIBLE, -0.5 * distance**2))
+    """Return the log prior of a pack's resistance [Ω]: of 12 V starter packs to old car packs."""
+    distance = np.log(np.maximum(ohm, 1e-12) / 0.12) / 1.2
+    return np.asarray(np.where((ohm < 0.008) | (ohm > 1.2), IMPOSSIBLE, -0.5 * distance**2))

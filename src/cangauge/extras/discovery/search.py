@@ -26,7 +26,7 @@ from cangauge.extras.discovery.candidate import (
     Level,
     is_capacity,
 )
-from cangauge.extras.discovery.fields import Field, Stream, collect, fields_of
+from cangauge.extras.discovery.fields import Field, Stream, collect, fields_of, most_common
 from cangauge.extras.discovery.pairs import (
     IMPOSSIBLE,
     LARGEST_R2,
@@ -52,38 +52,17 @@ VOLTAGE_SCALES: Final = {
 """Usual scales [V] and their log priors [nats], by their frequency in public DBC files."""
 SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
 """Usual scales of a SoC [%]."""
-NOMINAL_CELL_V: Final = 3.7
-"""Nominal voltage of an oxide cell [V], to count the cells that a scale implies."""
 BETWEEN_S: Final = 10.0
 """Pause that is put between captures [s]: as long as trends that the search takes away."""
-GRID_S: Final = 0.1
-"""Interval of the grid [s]: pack messages come every 10–100 ms."""
-MOST_CURRENTS: Final = 4000
-MOST_VOLTAGES: Final = 1500
-"""Most fields whose pairs are tried: 50 MB for each of a dozen quantities."""
 ENOUGH_NATS: Final = 3.0
-"""Evidence from current steps that is needed to decide without the user: as below."""
+"""Evidence that is needed to decide without the user: a likelihood ratio of 20."""
 MOVES: Final = 5
 """Steps of a current, each a tenth of its range, without which nothing proves it."""
-CLEARLY_NATS: Final = 3.0
-"""Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
-RIVAL: Final = 0.6
-"""Share of the first candidate's evidence with which another leaves the choice to the user: the
-evidence of loads that hang together differs by less than its saturation."""
-NOMINAL_SPREAD: Final = 0.03
-"""Log spread of a pack's middle voltage about the stated one."""
-ALIKE: Final = 0.01
-UNLIKELY: Final = 5.0
-"""Readings of a field that differ by less are one; less likely ones [nats] are none."""
-AT_HALF: Final = 0.03
-AT_HALF_NATS: Final = 3.0
-"""A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
-an offset; a voltage is there by chance once in twenty or thirty."""
-MOST_FRAMES: Final = 1_000_000
-"""Frames that are looked at, all ids over one time: 5–15 minutes of a car, hours of a module."""
 
 
-def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> Proposal:
+def search(
+    messages: Iterable[can.Message], nominal_v: float | None = None, at_most: int = 1_000_000
+) -> Proposal:
     """Return the candidates for current, voltage and SoC in the frames of a capture.
 
     Parameters
@@ -91,6 +70,9 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> P
     messages : iterable of can.Message
     nominal_v : float, optional
         Voltage of the pack, nominal or as a meter shows it [V]: decides the voltage's scale.
+    at_most : int
+        Frames that are looked at, all ids over one time: by default 5–15 minutes of a car, hours of
+        a module.
 
     Raises
     ------
@@ -98,12 +80,12 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> P
         If no id has enough frames.
     """
     frames = iter(messages)
-    streams = collect(islice(frames, MOST_FRAMES))
+    streams = collect(islice(frames, at_most))
     if not streams:
         raise InputError(
             "no id has enough frames to search", cure="record at least a minute, while driving"
         )
-    fields, grid = fields_of(streams), Grid(streams, GRID_S)
+    fields, grid = fields_of(streams), Grid(streams)
     current, voltage, row = _pair(fields, grid, nominal_v)
     soc = [] if row is None else _socs(fields, grid, current[0], voltage[0], row)
     remarks = []
@@ -145,9 +127,11 @@ def _is_clear(found: list[Candidate]) -> bool:
     first, *others = found
     if not (_is_proven(first) and first.is_repeated):
         return False
-    if any(each.evidence > RIVAL * first.evidence for each in others):
-        return False  # the inverter's pair and the pack's: both obey the same physics
-    return not others or first.score - others[0].score >= CLEARLY_NATS
+    # The inverter's pair and the pack's obey the same physics. The evidence of loads that hang
+    # together differs by less than its saturation.
+    if any(each.evidence > 0.6 * first.evidence for each in others):
+        return False
+    return not others or first.score - others[0].score >= 3.0  # a likelihood ratio of 20
 
 
 def _pair(
@@ -158,9 +142,10 @@ def _pair(
     voltages = [row for field in fields if (row := _as_voltage(field, nominal_v))]
     if not currents or not voltages:
         return [], [], None
-    # All pairs are held in memory: of the largest buses, the likelier fields.
-    currents = sorted(currents, key=attrgetter("prior"), reverse=True)[:MOST_CURRENTS]
-    voltages = sorted(voltages, key=attrgetter("prior"), reverse=True)[:MOST_VOLTAGES]
+    # All pairs are held in memory, 50 MB for each of a dozen quantities: of the largest buses, the
+    # likelier fields.
+    currents = sorted(currents, key=attrgetter("prior"), reverse=True)[:4000]
+    voltages = sorted(voltages, key=attrgetter("prior"), reverse=True)[:1500]
     return Pairs(voltages, currents, grid).best()
 
 
@@ -176,12 +161,7 @@ def _socs(
     span = grid.longest(0.5 * BETWEEN_S)
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
     least_ah = LEAST_HOURS * float(np.abs(amps).max())
-    found = (
-        _as_charge(
-            field, grid.means(field.stream, field.raw, field.missing)[span], drawn_ah, least_ah
-        )
-        for field in fields
-    )
+    found = (_as_charge(field, grid, span, drawn_ah, least_ah) for field in fields)
     taken, kept = current.bits | voltage.bits, []
     for each in sorted(filter(None, found), key=attrgetter("score"), reverse=True):
         if not each.bits & taken:  # a field of a better one
@@ -192,13 +172,12 @@ def _socs(
 
 def _as_current(field: Field) -> Row | None:
     """Return a field as a current; None where it has too few values."""
-    seen = field.statistics
     place, nature, constant = field.best
     is_signed, full = place.is_signed, 1 << place.width
-    if seen.distinct < 3 and not is_signed:
+    if len(np.unique(field.values)) < 3 and not is_signed:
         return None
-    prior = nature + _rate_prior(field.stream) + seen.prior
-    low, high = seen.low + constant, seen.high + constant
+    prior = nature + _rate_prior(field.stream) + field.prior
+    low, high = (float(end + constant) for end in (field.values.min(), field.values.max()))
     if is_signed and low < 0.0 <= high:
         # A measured current at rest hovers around zero, …
         prior += 1.0 if max(-low, high) < full >> 2 else 0.0
@@ -208,7 +187,8 @@ def _as_current(field: Field) -> Row | None:
     elif not is_signed:
         # … which an unsigned field holds as a round number.
         zeros = round_zeros(low, high, place.width)
-        rest = min((abs(each - seen.resting - constant) for each in zeros), default=math.inf)
+        resting = most_common(field.values) + constant
+        rest = min((abs(each - resting) for each in zeros), default=math.inf)
         if any(each and math.log2(each).is_integer() for each in zeros):
             prior += 1.0
         # A pack's current has two signs: a number from zero upwards is none.
@@ -233,14 +213,15 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
             continue
         if level > 0.95 * (1 << place.width):
             continue  # nearly all ones: a small negative number
-        at_half = abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF
-        prior = nature + _rate_prior(field.stream) + field.statistics.prior
-        prior -= AT_HALF_NATS if at_half else 0.0
+        # What rests at half its range is a torque, a yaw rate or the like with an offset; a voltage
+        # is there by chance once in twenty or thirty.
+        at_half = abs(level / (1 << (place.width - 1)) - 1.0) < 0.03
+        prior = nature + _rate_prior(field.stream) + field.prior - 3.0 * at_half
         for scale in VOLTAGE_SCALES:
             volts = level * scale
             likely = prior + _scale_prior(scale, volts, place.width, nominal_v)
             text = f"{volts:.3g} V at {scale:g} V a step of {place.width} bits"
-            text += f" (about {round(volts / NOMINAL_CELL_V)} cells)"
+            text += f" (about {round(volts / 3.7)} cells)"
             meant = Level(scale, volts, text)
             readings.append(Row(field, place, constant, missing, likely, meant))
     return _likeliest(readings, by_scale=nominal_v is None)
@@ -255,12 +236,12 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
     best = max(readings, key=attrgetter("prior"), default=None)
     if best is None or best.prior < IMPOSSIBLE / 2.0:
         return None
-    least = IMPOSSIBLE / 2.0 if by_scale else best.prior - UNLIKELY
+    least = IMPOSSIBLE / 2.0 if by_scale else best.prior - 5.0
     others = [
         each.level
         for each in readings
         if each.prior > least
-        and abs(each.level.value / best.level.value - 1.0) > ALIKE
+        and abs(each.level.value / best.level.value - 1.0) > 0.01
         and (each.place == best.place or not by_scale)
     ]
     best.levels = (best.level, *sorted(others)) if others else ()
@@ -268,17 +249,18 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
 
 
 def _as_charge(
-    field: Field, values: FloatArray, drawn_ah: FloatArray, least_ah: float
+    field: Field, grid: Grid, span: slice, drawn_ah: FloatArray, least_ah: float
 ) -> Candidate | None:
-    """Return a field as a SoC, if it falls as the charge is drawn; `values` by slot of time."""
-    seen = field.statistics
-    if field.best.place.is_signed or seen.distinct < 4:
+    """Return a field as a SoC, if it falls as the charge is drawn in a span of the grid."""
+    distinct = len(np.unique(field.values))
+    if field.best.place.is_signed or distinct < 4:
         return None
+    values = grid.means(field.stream, field.raw, field.missing)[span]
     spread, moved = float(np.std(values)), float(np.std(drawn_ah))
     r = correlation(values, drawn_ah)
     if r > -0.95:
         return None
-    evidence = -0.5 * seen.distinct * math.log(1.0 - min(r * r, LARGEST_R2))
+    evidence = -0.5 * distinct * math.log(1.0 - min(r * r, LARGEST_R2))
     readings: list[Row] = []
     for place, nature, constant in field.extents:
         for scale in SOC_SCALES:
@@ -318,7 +300,8 @@ def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None
     Most cars have 250–450 V, and a full scale not far beyond.
     """
     if nominal_v is not None:
-        return max(-0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2, IMPOSSIBLE)
+        # A pack's middle voltage lies within some per cent of the stated one.
+        return max(-0.5 * (math.log(volts / nominal_v) / 0.03) ** 2, IMPOSSIBLE)
     level = {30: IMPOSSIBLE, 100: -2.2, 250: -1.5, 450: 0.0, 900: -1.2, math.inf: IMPOSSIBLE}
     full = {380: -1.0, 1400: 0.0, math.inf: -0.3 if scale <= 0.1 else -2.0}
     return VOLTAGE_SCALES[scale] + _step(volts, level) + _step(scale * (1 << width), full)
