@@ -19,7 +19,6 @@ _ROADS: Final = {
     "motorway": ((24.0, 36.0), (120.0, 900.0), (2.0, 20.0)),
 }
 """Road → cruise speed [m/s], cruise duration [s], stop between micro-trips [s]."""
-_GRAVITY_M_S2: Final = 9.81
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +233,7 @@ def _battery_power(rng: np.random.Generator, speed: FloatArray, auxiliary_w: flo
     drag = 0.5 * 1.2 * rng.uniform(0.60, 0.75)
     rolling = rng.uniform(0.008, 0.012) * (speed > 0.1)
     slope = _smooth(rng, speed.size, 45.0) * rng.uniform(0.0, 0.015)
-    force = mass_kg * (1.04 * np.gradient(speed) + _GRAVITY_M_S2 * (slope + rolling))
+    force = mass_kg * (1.04 * np.gradient(speed) + 9.81 * (slope + rolling))
     wheel_w = (force + drag * speed**2) * speed
     driven_w = np.maximum(wheel_w, 0.0) / rng.uniform(0.82, 0.90)
     # Friction brakes take over below walking pace and above 60 kW.

@@ -27,28 +27,6 @@ _TOLERANCE: Final = 0.03
 
 
 @dataclass(frozen=True)
-class ShapeRange:
-    """Range of a shape parameter: drawn from low to high, or whole, or even in the logarithm.
-
-    `accepted` is the range that a user may give; by default from low to high.
-    """
-
-    low: float
-    high: float
-    logarithmic: bool = False
-    whole: bool = False
-    accepted: tuple[float, float] | None = None
-
-    def draw(self, rng: np.random.Generator) -> float:
-        """Draw a value."""
-        if self.whole:
-            return float(rng.integers(int(self.low), int(self.high) + 1))
-        if self.logarithmic:
-            return log_uniform(rng, self.low, self.high)
-        return rng.uniform(self.low, self.high)
-
-
-@dataclass(frozen=True)
 class FaultKind:
     """A kind of fault.
 
@@ -66,8 +44,9 @@ class FaultKind:
         Property of the pack whose multiples these are.
     signed : bool
         Whether the size may be negative.
-    shape : dict of str to ShapeRange
-        Further parameters.
+    shape : dict of str to dict
+        Further parameters, each with the arguments of `_draw`; `accepted` is the range that a user
+        may give, by default from `low` to `high`.
     """
 
     id: str
@@ -78,7 +57,7 @@ class FaultKind:
     times: str | None = None
     signed: bool = False
     outside: bool = False
-    shape: Mapping[str, ShapeRange] = field(default_factory=dict)
+    shape: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
     def limits(self, pack: TwinPack) -> tuple[float, float]:
         """Return the smallest and largest physical size for a pack, both positive."""
@@ -87,12 +66,7 @@ class FaultKind:
         return low * unit, high * unit
 
 
-def _kind(fault_id: str, stated: dict[str, Any]) -> FaultKind:
-    shape = {name: ShapeRange(**of) for name, of in stated.pop("shape", {}).items()}
-    return FaultKind(fault_id, **stated, shape=shape)
-
-
-_KINDS: Final = {name: _kind(name, stated) for name, stated in read_table("faults.toml").items()}
+_KINDS: Final = {name: FaultKind(name, **of) for name, of in read_table("faults.toml").items()}
 
 
 def fault_kinds(*, outside: bool = False) -> tuple[FaultKind, ...]:
@@ -136,7 +110,7 @@ class Fault:
     def full_shape(self) -> dict[str, float]:
         """All shape parameters, given or drawn."""
         rng = np.random.default_rng(self.seed)
-        drawn = {name: values.draw(rng) for name, values in self.kind.shape.items()}
+        drawn = {name: _draw(rng, **of) for name, of in self.kind.shape.items()}
         return {**drawn, **self.shape}
 
     def is_active(self, time_s: FloatArray) -> BoolArray:
@@ -151,6 +125,21 @@ class Fault:
         lengths = np.random.default_rng(self.seed).exponential(1.0, (pairs, 2)) * (off_s, on_s)
         edges = time_s[0] + np.cumsum(lengths.ravel())
         return np.asarray(np.searchsorted(edges, time_s, side="right") % 2 == 1)
+
+
+def _draw(
+    rng: np.random.Generator,
+    low: float,
+    high: float,
+    *,
+    logarithmic: bool = False,
+    whole: bool = False,
+    **_: object,
+) -> float:
+    """Draw a number from low to high: even, even in the logarithm, or whole."""
+    if whole:
+        return float(rng.integers(int(low), int(high) + 1))
+    return log_uniform(rng, low, high) if logarithmic else rng.uniform(low, high)
 
 
 class Faults(dict[str, Fault]):
@@ -275,7 +264,8 @@ def _parameter(kind: FaultKind, text: str) -> tuple[str, float]:
         raise _refused("not a number", text)
     if name in kind.shape:
         of = kind.shape[name]
-        _require(number, *(of.accepted or (of.low, of.high)), name)
+        low, high = of.get("accepted", (of["low"], of["high"]))
+        _require(number, low, high, name)
     return name, number
 
 

@@ -36,8 +36,6 @@ _KNOTS: Final = np.array([0.0, 0.02, 0.05, *np.linspace(0.1, 0.9, 17), 0.95, 1.0
 """Knots of the surrogate's open-circuit voltage over the SoC [-]."""
 _LAGS_S: Final = (20.0, 200.0)
 """Lags of the current whose voltage is not taken for a slope over SoC [s]."""
-_SMOOTHNESS: Final = 0.02
-"""Weight of the curve's second differences against the voltages."""
 _LEAST_S: Final = 60.0
 """Duration below which a log shows no fault of the pack [s]."""
 _RESOLUTIONS: Final = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001)
@@ -129,7 +127,7 @@ def fit_surrogate_pack(
         volts.append(np.interp(time_s, log.time_s, log.voltage_v))
     voltage_v = np.concatenate(volts)
     # Second differences regularize the curve where the logs have no data.
-    bends = np.diff(np.eye(_KNOTS.size), 2, axis=0) * _SMOOTHNESS * np.sqrt(voltage_v.size)
+    bends = np.diff(np.eye(_KNOTS.size), 2, axis=0) * 0.02 * np.sqrt(voltage_v.size)
     bends = np.pad(bends, ((0, 0), (0, 1 + len(_LAGS_S))))
     solution, *_ = np.linalg.lstsq(
         np.vstack([*rows, bends]), np.concatenate([voltage_v, np.zeros(len(bends))])

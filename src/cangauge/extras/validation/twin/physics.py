@@ -28,23 +28,16 @@ _GLASS_K: Final = 230.0
 _VOGEL_K: Final = 170.0
 """Temperature at which the electrolyte stops conducting [K]: Vogel–Fulcher–Tammann."""
 _GAS_OVER_FARADAY_V_K: Final = 8.617333e-5
-_BEND_A: Final = 3.0
-"""Current within which a rectifying contact turns over [A]."""
 _REACHES: Final = np.array([0.06, 0.15, 0.35, 0.65, 1.0])
 """Reaches of the stop operators of the hysteresis, relative to the fault's."""
 _COLE_SPREAD: Final = np.array([-1.6, -1.0, -0.5, 0.0, 0.5, 1.0, 1.6])
 """Relaxations of a Cole–Cole element, in e-folds of its time constant."""
 _WARBURG_POLES: Final = np.arange(1.0, 12.0, 2.0) ** 2
 """First six poles of a finite Warburg element, relative to the slowest."""
-_ADDED_ACTIVATION_K: Final = 1500.0
-"""Activation energy of added relaxations over the gas constant [K]."""
 _EMPTY_V: Final = {"lfp": 1.8}
 """Voltage of the lowest cell at which the car stops [V]; of oxides 2.2 V."""
-_THERMAL_STEP_S: Final = 5.0
-"""Step of the thermal integration [s]: the shortest time constant is minutes."""
 TOLERANCE_K: Final = 0.05
 """Change of the core temperature at which the thermal iteration stops [K]."""
-_MAX_ITERATIONS: Final = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +105,7 @@ def simulate_truth(
     else:
         core, surface = near.core_c, near.surface_c
     truth = respond(pack, drive, faults, core, surface)
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(5):
         core, surface = temperatures(pack, drive, truth.heat_w, insulation)
         if np.max(np.abs(core - truth.core_c)) < TOLERANCE_K:
             break
@@ -283,7 +276,7 @@ def temperatures(
     insulation : float
         Additional thermal resistance between core and surface, relative to the healthy one [-].
     """
-    every = max(1, round(_THERMAL_STEP_S / drive.step_s))
+    every = max(1, round(5.0 / drive.step_s))  # 5 s: the shortest time constant is minutes
     starts = np.arange(0, drive.time_s.size, every)
     heat = np.add.reduceat(heat_w, starts) / np.diff(np.append(starts, drive.time_s.size))
     G, H = pack.core_surface_w_k / (1.0 + insulation), pack.surface_ambient_w_k
@@ -332,15 +325,14 @@ def _soc_rise(faults: Faults, z: FloatArray) -> FloatArray | float:
 
 def _added_drop(drive: Drive, faults: Faults, I: FloatArray, T: FloatArray) -> FloatArray:
     """Return the voltage drop of faults around the cells [V], shape (n,)."""
-    # A rectifying contact, smooth over some amperes around 0.
-    charging = 0.5 * (1.0 - I / np.hypot(I, _BEND_A))
+    charging = 0.5 * (1.0 - I / np.hypot(I, 3.0))  # a contact that rectifies, smooth over 3 A
     ohm = faults.size("resistance_asymmetry") * charging + faults.size("resistance_growth")
     if (step := faults.get("resistance_step")) is not None:
         ohm = ohm + step.size * (drive.time_s >= step.full_shape["at_s"])
     if (contact := faults.get("contact_flicker")) is not None:
         ohm = ohm + contact.size * contact.is_active(drive.time_s)
     drop = ohm * I
-    slower = np.exp(_ADDED_ACTIVATION_K * _over(T, 0.0))
+    slower = np.exp(1500.0 * _over(T, 0.0))  # activation energy over the gas constant [K]
     for name, modes in (("fast_polarization", cole_cole), ("slow_diffusion", finite_warburg)):
         if name in faults:
             ohms, taus_s = modes(faults[name])

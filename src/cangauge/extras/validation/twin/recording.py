@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
@@ -25,9 +24,6 @@ from cangauge.extras.validation.twin.physics import (
     stopped,
 )
 from cangauge.logs.log import Log
-
-_LEAST_S: Final = 900.0
-"""A size that ends a drive before this, or before its half, is impossible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +107,8 @@ def scale_to_gap(
 
     The size of `fault` gives the sign; `healthy` is the drive without it.
     """
-    least_s = min(_LEAST_S, 0.5 * float(drive.time_s[-1]))
+    # A size that empties the pack sooner than in a quarter of an hour, or the half, is impossible.
+    least_s = min(900.0, 0.5 * float(drive.time_s[-1]))
 
     def gap_of(sized: Fault) -> float:
         read = read_drive(pack, drive, Faults.of([sized]), healthy)
