@@ -282,8 +282,8 @@ class _Order:
         flips = moved.sum(0)
         if not is_motorola:
             dead = dead[[_turned(place, payload.shape[1]) for place in range(len(dead))]]
-        linked, cut = _links(bits, flips)
         padded = np.pad(ordered, ((0, 0), (0, 2)))
+        linked, cut = _links(bits, flips)
         linked |= _together(moved)
         return cls(is_motorola, padded, flips, bits.mean(0) > 0.5, dead, linked, cut)
 
@@ -301,9 +301,7 @@ def _turned(place: int, length: int) -> int:
 
 def _links(bits: NDArray[np.uint8], flips: NDArray[np.int64]) -> tuple[BoolArray, BoolArray]:
     """Return by cut whether carries cross it, and whether they surely do not; see `_Order`."""
-    count = bits.shape[1]
-    linked, apart = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-    wide = bits.astype(np.int16)
+    linked, apart = np.zeros((2, bits.shape[1]), np.bool_)
     for cut in np.flatnonzero((flips[:-1] > 0) & (flips[1:] > 0)).tolist():
         # Only bits that move: a lone sign bit steps up where its number falls.
         top = cut
@@ -311,14 +309,10 @@ def _links(bits: NDArray[np.uint8], flips: NDArray[np.int64]) -> tuple[BoolArray
             top -= 1
         if top == cut:
             continue
-        above = wide[:, top : cut + 1]
-        below = wide[:, cut + 1 : cut + 7]
-        high = above @ (1 << np.arange(above.shape[1] - 1, -1, -1, dtype=np.int16))
-        low = below @ (1 << np.arange(below.shape[1] - 1, -1, -1, dtype=np.int16))
-        modulus = 1 << above.shape[1]
-        step = np.diff(high) % modulus
-        change = np.diff(low) / float(1 << below.shape[1])
-        carries = np.concatenate([-change[step == 1], change[step == modulus - 1]])
+        above, below = 1 << cut + 1 - top, bits[:, cut + 1 : cut + 7]
+        step = np.diff(_codes(bits, top, cut + 1 - top)) % above
+        change = np.diff(_codes(bits, cut + 1, below.shape[1])) / float(1 << below.shape[1])
+        carries = np.concatenate([-change[step == 1], change[step == above - 1]])
         if len(carries) >= LINK_EVENTS:
             still = change[(step == 0) & (change != 0.0)]
             error = 2.0 * (carries.std() / np.sqrt(len(carries)) + 0.3 / len(carries))

@@ -286,7 +286,7 @@ class Pairs:
             self.r > 0.5
         )
         ids = [np.array([id(row.field.stream) for row in each]) for each in (voltages, currents)]
-        # Correlated loads (torque, power) are no independent samples: from 20 nats on they count half.
+        # Loads are correlated (torque, power): from 20 nats on further samples count half.
         self.evidence = 20.0 * np.log1p(evidence / 20.0)
         self.score = (
             self.evidence

@@ -26,7 +26,7 @@ from cangauge.extras.discovery.candidate import (
     Level,
     is_capacity,
 )
-from cangauge.extras.discovery.fields import Field, Stream, collect, fields_of, most_common
+from cangauge.extras.discovery.fields import Field, collect, fields_of, most_common
 from cangauge.extras.discovery.pairs import (
     IMPOSSIBLE,
     LARGEST_R2,
@@ -176,7 +176,7 @@ def _as_current(field: Field) -> Row | None:
     is_signed, full = place.is_signed, 1 << place.width
     if len(np.unique(field.values)) < 3 and not is_signed:
         return None
-    prior = nature + _rate_prior(field.stream) + field.prior
+    prior = nature + field.prior
     low, high = (float(end + constant) for end in (field.values.min(), field.values.max()))
     if is_signed and low < 0.0 <= high:
         # A measured current at rest hovers around zero, …
@@ -216,7 +216,7 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
         # What rests at half its range is a torque, a yaw rate or the like with an offset; a voltage
         # is there by chance once in twenty or thirty.
         at_half = abs(level / (1 << (place.width - 1)) - 1.0) < 0.03
-        prior = nature + _rate_prior(field.stream) + field.prior - 3.0 * at_half
+        prior = nature + field.prior - 3.0 * at_half
         for scale in VOLTAGE_SCALES:
             volts = level * scale
             likely = prior + _scale_prior(scale, volts, place.width, nominal_v)
@@ -285,13 +285,6 @@ def _as_charge(
         correlation=r,
         partner=f"{capacity_ah:.0f} Ah per 100 %",
     )
-
-
-def _rate_prior(stream: Stream) -> float:
-    """Return the log prior of a period: pack messages are fast, and not in turns."""
-    if stream.selector is not None:
-        return -2.0
-    return _step(stream.period_s, {0.025: 0.8, 0.11: 0.4, 0.3: 0.0, math.inf: -1.0})
 
 
 def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None) -> float:
