@@ -121,7 +121,7 @@ def tables(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> li
         ("one floor or more, 10 references", lambda x: x.floors >= 1 and x.references >= 10),
         ("one floor or more, 2 to 6 logs", lambda x: x.floors >= 1 and x.logs > 1),
     ]
-    packs = sorted({x.pack for x, _ in known})
+    packs = sorted({x.pack for x, _ in known if x.world != "simulated"})
     groups += [
         (f"one floor or more, {k}", lambda x, k=k: x.floors >= 1 and x.pack == k)  # type: ignore[misc]
         for k in packs

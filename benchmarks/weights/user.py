@@ -95,12 +95,15 @@ def _wrong_models(model: Model) -> dict[str, Model]:
     scaled = replace(loads.arrhenius, resistance_ohm=tuple(three))
     flat = replace(loads.arrhenius, factor=0.0)
     higher = [volts + 8.0 for volts in curve.voltage_v]
+    three_times = {
+        "loads": loads.model_copy(update={"resistance_ohm": tuple(tripled), "arrhenius": scaled})
+    }
+    eight_volts = {"curve": curve.model_copy(update={"voltage_v": tuple(higher)})}
     return {
         "as fitted": model,
-        "resistances × 3": model.model_copy(update={"loads": loads.model_copy(
-            update={"resistance_ohm": tuple(tripled), "arrhenius": scaled})}),
-        "+ 8 V": model.model_copy(
-            update={"curve": curve.model_copy(update={"voltage_v": tuple(higher)})}),
+        "resistances × 3": model.model_copy(update=three_times),
+        "+ 8 V": model.model_copy(update=eight_volts),
+        "resistances × 3, + 8 V": model.model_copy(update=three_times | eight_volts),
         "without R(T)": model.model_copy(
             update={"loads": loads.model_copy(update={"arrhenius": flat})}),
         "capacity × 1.25": model.model_copy(update={"capacity_ah": 1.25 * model.capacity_ah}),

@@ -164,6 +164,26 @@ def test_a_model_with_a_wrong_level_is_told_first(references: list[Log], model: 
     assert judged(found, initial_soc=1.0).why_not is None
 
 
+def test_two_errors_of_a_model_that_cancel_are_both_told(
+    references: list[Log], model: Model
+) -> None:
+    """The sag of three times the resistance hides a level that is too high."""
+    assert model.loads is not None
+    assert model.curve is not None
+    ohm = tuple(3.0 * each for each in model.loads.resistance_ohm)
+    volts = tuple(each + 8.0 for each in model.curve.voltage_v)
+    both = {
+        "loads": model.loads.model_copy(update={"resistance_ohm": ohm}),
+        "curve": model.curve.model_copy(update={"voltage_v": volts}),
+    }
+    found = diagnose([day(20)], model.model_copy(update=both), references)
+    check = found.model_check
+    assert check is not None
+    faults = {each.evidence.fault for each in check.missed}
+    assert faults == {"resistance", "voltage_reading"}
+    assert check.missed[-1].rmse_v < 2.0 * check.among_themselves_rmse_v
+
+
 def test_the_model_as_fitted_describes_the_references(references: list[Log], model: Model) -> None:
     found = diagnose([day(20)], model, references)
     assert found.to_json()["model"]["describes_references"] is True
@@ -256,6 +276,15 @@ def test_of_two_stated_faults_the_likelier_corrects(
     words = {"initial_soc": "wrong start", "voltage_offset": "voltage reading"}
     assert f"with the {words[likelier]} corrected (" in both.summary
     assert f"with the {words[other]})" in both.summary
+
+
+def test_faults_that_look_alike_are_told_together(faulty: Diagnosis) -> None:
+    both = judged(faulty, voltage_offset=0.5, initial_soc=0.4, weak_cell=0.1).summary
+    assert "the level of the voltage (voltage reading, wrong start or slow voltage) 90 %." in both
+    apart = judged(faulty, voltage_offset=0.5, weak_cell=0.3, initial_soc=0.2).summary
+    assert "level of the voltage" not in apart
+    alone = judged(faulty, voltage_offset=0.95, initial_soc=0.05).summary
+    assert "level of the voltage" not in alone
 
 
 def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:

@@ -71,11 +71,11 @@ class ModelCheck:
 def check_model(model: Model, healthy: Healthy) -> ModelCheck:
     """Return what a model misses on references, two at least."""
     among_v, references = healthy.rmse_v, healthy.references
-    found: list[Missed] = []
     now, extended = model, model.extended_model()
-    before_v = rmse_v = _rmse_v(extended, references)
     expected_v = _expected_v(model, healthy)
-    while rmse_v > BEYOND * expected_v and len(found) < EFFECTS_AT_MOST:
+    found: list[Missed] = []
+    models, errors_v = [extended], [_rmse_v(extended, references)]
+    while errors_v[-1] > BEYOND * expected_v and len(found) < EFFECTS_AT_MOST:
         alone = replace(
             of_model(now, among_v),
             mean_squares_v2=healthy.mean_squares_v2,
@@ -85,23 +85,21 @@ def check_model(model: Model, healthy: Healthy) -> ModelCheck:
         logs = [log_rows(alone.linear, log, alone.tried, []) for log in references]
         evidence = simulated(alone, logs, analyse(alone, logs))
         answer = posterior(alone, logs, evidence)
-        left_v, changed = {}, {}
+        changed, left_v = {}, {}
         for name, of in evidence.items():
             if of.fault not in OF_LOGS:
-                changed[name] = added(extended, of.shape.effect, of.shape.values(of.size))
+                changed[name] = added(models[-1], of.shape.effect, of.shape.values(of.size))
                 left_v[name] = _rmse_v(changed[name], references)
-        # Of those that suffice the most probable; else what closes most.
+        # Of those that suffice the most probable, else of all. Two effects may cancel: without one
+        # of them the error grows, until the other is found too.
         enough = [name for name, v in left_v.items() if v <= BEYOND * expected_v]
-        if enough:
-            effect = max(enough, key=answer.probabilities.__getitem__)
-        else:
-            effect = min(left_v, key=left_v.__getitem__)
-        if left_v[effect] >= rmse_v:
-            break
-        extended, rmse_v = changed[effect], left_v[effect]
-        now = now.model_copy(update={"effects": effect_entries(extended.effects)})
-        found.append(Missed(evidence[effect], answer, rmse_v))
-    return ModelCheck(before_v, among_v, expected_v, tuple(found), extended)
+        effect = max(enough or left_v, key=answer.probabilities.__getitem__)
+        models.append(changed[effect])
+        errors_v.append(left_v[effect])
+        now = now.model_copy(update={"effects": effect_entries(models[-1].effects)})
+        found.append(Missed(evidence[effect], answer, left_v[effect]))
+    best = int(np.argmin(errors_v))
+    return ModelCheck(errors_v[0], among_v, expected_v, tuple(found[:best]), models[best])
 
 
 def _expected_v(model: Model, healthy: Healthy) -> float:

@@ -43,6 +43,13 @@ ALARM: Final = 0.05
 LIKELY: Final = 0.2
 """Probability of `none` up to which a gap is called likely: odds of 4 to 1."""
 
+ALIKE: Final = {
+    "level of the voltage": ("voltage_reading", "start", "slow_voltage"),
+    "count of the charge": ("current_reading", "capacity"),
+    "drop under load": ("resistance", "temperature"),
+}
+"""What is off → faults that make it so and look alike over a narrow SoC or temperature."""
+
 UNTESTED: Final = 3.0
 """A healthy log may have this many times the error that a model file states: it is of other logs,
 and no left-out reference shows how much logs differ."""
@@ -191,6 +198,18 @@ class Posterior:
             return ()
         first, second, *_ = self.faults
         return (first,) if self.within_gap(first) >= self.stated_from else (first, second)
+
+    @property
+    def alike(self) -> str | None:
+        """What is off, where faults that look alike are together as sure as one must be."""
+        if len(self.stated) < 2:
+            return None
+        sure = [
+            what
+            for what, faults in ALIKE.items()
+            if sum(map(self.within_gap, faults)) >= self.stated_from
+        ]
+        return next(iter(sure), None)
 
     def within_gap(self, fault: str) -> float:
         """Return the probability of a fault where there is a gap."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from cangauge._text import counted, number, significant
 from cangauge.diagnosis.faults import FAULT, shown_unit
+from cangauge.diagnosis.posterior import ALIKE, Posterior
 from cangauge.diagnosis.rows import COVER_PCT
 from cangauge.diagnosis.simulator import correction
 from cangauge.diagnosis.where import clause
@@ -95,7 +96,17 @@ def _what(found: Diagnosis) -> str:
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
     texts = [found.sentence(found.best_of(fault)) for fault in posterior.stated]
     what = ", or ".join([texts[0], *map(_lower, texts[1:])]) + "."
-    return f"{what} Likelihood: {_likeliest(found)}.{sure}"
+    return f"{what} Likelihood: {_likeliest(found)}{_together(posterior)}.{sure}"
+
+
+def _together(posterior: Posterior) -> str:
+    """Return what is off where only a group of faults is sure, as the end of a sentence."""
+    if posterior.alike is None:
+        return ""
+    faults = ALIKE[posterior.alike]
+    *others, last = (FAULT[fault].title for fault in faults)
+    together = percent(sum(posterior.faults[fault] for fault in faults))
+    return f"; the {posterior.alike} ({', '.join(others)} or {last}) {together}"
 
 
 def _likeliest(found: Diagnosis) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -137,9 +137,14 @@ def excesses(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, An
     return found
 
 
+def stands_out(place: Mapping[str, Any]) -> bool:
+    """Return whether the error of an interval is larger than that of all rows for certain."""
+    return bool(place["excess"] >= DIFFERENT and place["ci"][0] > 1.0)
+
+
 def clause(where: Sequence[dict[str, Any]]) -> str:
     """Return where the error is larger than elsewhere, in a clause."""
-    worst = [place for place in where if place["excess"] >= DIFFERENT and place["ci"][0] > 1.0]
+    worst = [place for place in where if stands_out(place)]
     if not worst:
         return "everywhere alike"
     lowest = [place["ci"][0] for place in worst]

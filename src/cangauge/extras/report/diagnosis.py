@@ -12,6 +12,7 @@ from cangauge._text import NONE_KNOWN, number, span
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.faults import FAULT
 from cangauge.diagnosis.text import fault_rows, percent, plan_text
+from cangauge.diagnosis.where import stands_out
 from cangauge.extras.report.charts import (
     BLUE,
     GREEN,
@@ -125,8 +126,10 @@ def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
         shown = [place for place in where if place["axis"] == axis]
         entries = [(_interval(place), place["rmse_v"], ORANGE) for place in shown]
         largest = max(shown, key=itemgetter("excess"))
-        times = number(largest["excess"], 1)
-        caption = f"{times} times the error of all rows at {_interval(largest)}."
+        caption = "No interval stands out from the others."
+        if stands_out(largest):
+            times = number(largest["excess"], 1)
+            caption = f"At {_interval(largest)} it is {times} times that of all rows."
         title = f"Where: {_AXES.get(axis, axis)}"
         figures[axis] = bars(title, "RMS error of the model", entries, caption, unit="V")
     return figures
