@@ -21,6 +21,7 @@ import threading
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -37,7 +38,7 @@ from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
-from cangauge.replay.player import ReplaySettings, play
+from cangauge.replay.player import play
 from cangauge.replay.steps import LogSource, quantization_bound
 from cangauge.service.config import RunConfig
 from cangauge.service.loop import Loop
@@ -53,7 +54,7 @@ TEST = [f"A{number:02d}" for number in range(2, 23, 2)]
 PLAYED_S = 15 * 60.0
 """Only longer trips are played [s]."""
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v")
-FULL_SPEED = ReplaySettings(speed=math.inf, acknowledge_s=20.0)
+FULL_SPEED: dict[str, Any] = {"speed": math.inf, "acknowledge_s": 20.0}
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def over_bus(
         service.start()
         began = time.monotonic()
         try:
-            play(sender, LogSource(log, vehicle), FULL_SPEED, stop=lambda: not service.is_alive())
+            play(sender, LogSource(log, vehicle), **FULL_SPEED, stop=lambda: not service.is_alive())
         finally:
             done.set()
             service.join()
@@ -138,9 +139,9 @@ def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Co
         lost=len(log) - len(rows) + pipeline.counts.lost,
         seconds=seconds,
         difference_pct=largest("soc_pct"),
-        bound_pct=bound.ekf_pct,
+        bound_pct=bound["ekf"],
         newton_difference_pct=largest("soc_newton_pct"),
-        newton_bound_pct=bound.newton_pct,
+        newton_bound_pct=bound["newton"],
         is_bit_for_bit=all(
             np.array_equal(live[name], getattr(recorded, name), equal_nan=True) for name in NUMBERS
         ),

@@ -103,7 +103,7 @@ def samples_of(path: Path, preset: str, vehicle: cangauge.Vehicle) -> dict[str, 
     record: dict[str, Any] = {
         "samples": len(found),
         **{name: column(getattr(found, name)) for name in names},
-        "frames": found.info["frames"],
+        "frames": counts.frames,
         "counts": {
             name: getattr(counts, name)
             for name in ("crc_errors", "counter_repeats", "counter_jumps", "frames_lost", "short",

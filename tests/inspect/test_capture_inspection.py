@@ -61,7 +61,10 @@ def test_inspection_lists_frames_protection_and_vehicle(tmp_path: Path, generic:
     assert found.matching == ("generic",)
     assert found.duration_s == pytest.approx(21.0, abs=0.01)
     assert (found.error_frames, found.remote_frames) == (1, 1)
-    assert [(g.start_s, round(g.length_s, 3)) for g in found.gaps] == [(1005.0, 3.0), (1019.9, 1.1)]
+    assert [(g["start_s"], round(g["length_s"], 3)) for g in found.gaps] == [
+        (1005.0, 3.0),
+        (1019.9, 1.1),
+    ]
     current = next(each for each in found.ids if each.id == "400")
     assert (current.protection, current.bytes, current.bus) == ("generic", "6", "can0")
     assert current.period_s == pytest.approx(0.1)

@@ -48,7 +48,7 @@ def two_days(gap_s: float = 4.0 * 3600.0) -> Log:
 
 
 def ability(found: LogInspection, topic: str) -> tuple[str, str]:
-    return next((a.verdict, a.text) for a in found.abilities if a.topic == topic)
+    return found.abilities[topic]
 
 
 def test_steps_of_a_slow_log_have_its_own_seconds() -> None:

@@ -8,6 +8,7 @@ import random
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -22,7 +23,7 @@ from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.replay.player import ReplaySettings, ReplayState, play
+from cangauge.replay.player import ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.pipeline import NOTHING_YET, PipelineSettings
 from cangauge.service.record import Recorder
@@ -41,17 +42,17 @@ from selection import nightly_except
 
 NOWHERE = BusAddress("virtual", "x")
 
-MAX = ReplaySettings(speed=math.inf, acknowledge_s=3.0)
+MAX: dict[str, Any] = {"speed": math.inf, "acknowledge_s": 3.0}
 REPLAYED = PipelineSettings(time_source="replay-clock")
 SOC_FRAMES = [standard_filter(0x5A0), standard_filter(0x5A1)]
 
 
 def play_log(
-    channel: str, seconds: float, settings: ReplaySettings, preset: str = "generic"
+    channel: str, seconds: float, settings: dict[str, Any], preset: str = "generic"
 ) -> ReplayState:
     with virtual_port(channel, SOC_FRAMES) as port:
         source = LogSource(short_log(seconds), Vehicle.load(preset))
-        return play(port, source, settings, stop=never)
+        return play(port, source, **settings, stop=never)
 
 
 @pytest.mark.parametrize(
@@ -72,23 +73,22 @@ def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) 
     offline = run_estimator(samples_of(log), model, estimator).soc_pct
     live = np.array([estimate.soc_pct for _, estimate in service.rows])
     bound = quantization_bound(vehicle, model, log)
-    limit = {"ekf": bound.ekf_pct, "newton": bound.newton_pct, "coulomb": bound.coulomb_pct}
     worst = float(np.max(np.abs(live - offline)))
-    assert worst <= limit[method] + 1e-9
+    assert worst <= bound[method] + 1e-9
     # The bound is tight: quantization shows, not far below it.
-    assert worst > limit[method] / 200.0
+    assert worst > bound[method] / 200.0
 
 
 def test_the_bound_follows_its_equation() -> None:
     log, model = short_log(200.0), leaf_model()
     bound = quantization_bound(Vehicle.load("leaf_aze0"), model, log)
     # 0.25 A over the log's length; no stamp of this log needs rounding.
-    assert bound.coulomb_pct == pytest.approx(0.25 * log.duration_s / 36.0 / 51.5, rel=1e-6)
+    assert bound["coulomb"] == pytest.approx(0.25 * log.duration_s / 36.0 / 51.5, rel=1e-6)
     resistance = 0.1032 + 0.01501 + 0.009697 + 0.004652
     volts = 0.25 + 0.7428 * 0.25 + 0.25 * resistance
     slope = min(model.voltage_model().pseudo_ocv_at(soc)[1] for soc in np.arange(0.0, 100.1, 0.1))
-    assert bound.newton_pct == pytest.approx(volts / slope, rel=1e-3)
-    assert bound.ekf_pct == bound.coulomb_pct + bound.newton_pct
+    assert bound["newton"] == pytest.approx(volts / slope, rel=1e-3)
+    assert bound["ekf"] == bound["coulomb"] + bound["newton"]
 
 
 def test_a_replay_waits_for_the_service_without_loss() -> None:
@@ -117,7 +117,7 @@ def test_the_last_samples_are_acknowledged() -> None:
 
 
 def test_a_missing_receiver_is_an_error_of_one_line() -> None:
-    settings = ReplaySettings(speed=math.inf, acknowledge_s=0.4)
+    settings = {"speed": math.inf, "acknowledge_s": 0.4}
     with pytest.raises(CangaugeError, match="--time-source replay-clock") as caught:
         play_log("alone", 10.0, settings)
     assert caught.value.exit_code == 1
@@ -125,7 +125,7 @@ def test_a_missing_receiver_is_an_error_of_one_line() -> None:
 
 
 def test_a_service_for_another_vehicle_is_an_error() -> None:
-    settings = ReplaySettings(speed=math.inf, acknowledge_s=0.5)
+    settings = {"speed": math.inf, "acknowledge_s": 0.5}
     source = LogSource(short_log(100.0), Vehicle.load("generic"))
     with (
         virtual_port("other", SOC_FRAMES) as port,
@@ -134,7 +134,7 @@ def test_a_service_for_another_vehicle_is_an_error() -> None:
     ):
         assert other.receive(PATIENCE_S)  # the player waits less than SOC_DETAIL's interval
         with pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"):
-            play(port, source, settings, stop=never)
+            play(port, source, **settings, stop=never)
 
 
 def test_a_second_sender_on_the_bus_is_an_error() -> None:
@@ -182,7 +182,7 @@ def test_lost_frames_are_counted_and_the_replay_goes_on() -> None:
     with virtual_service("lossy", REPLAYED, vehicle=Vehicle.load("leaf_aze0")) as service:
         port = BusConnection(bus, NOWHERE)  # type: ignore[arg-type] # has what is used of a bus
         with port:
-            state = play(port, source, MAX, stop=never)
+            state = play(port, source, **MAX, stop=never)
         assert service.pipeline.counts.lost > 0
     assert state.acknowledged is not None
     assert 0 < state.lost <= 4
@@ -214,7 +214,7 @@ def test_frames_under_way_are_bounded() -> None:
     with BusConnection(bus, NOWHERE) as port:
         thread.start()
         source = LogSource(short_log(50.0), Vehicle.load("generic"))
-        state = play(port, source, MAX, stop=never)
+        state = play(port, source, **MAX, stop=never)
     thread.join()
     receiver.shutdown()
     assert state.acknowledged == 500
@@ -253,7 +253,7 @@ def test_recorded_timing_is_kept(
         for time_s in times:
             writer.on_message_received(can.Message(timestamp=1.7e9 + time_s, arbitration_id=0x1F0))
     bus = QuietBus(monkeypatch, late_s=late_s)
-    state = play(bus, CaptureSource(path), ReplaySettings(speed), stop=never)  # type: ignore[arg-type] # has what is used
+    state = play(bus, CaptureSource(path), speed=speed, stop=never)  # type: ignore[arg-type] # has what is used
     sent_s = np.array([at for at, frame in bus.sent if frame.arbitration_id == 0x1F0])
     clocks = [frame for _, frame in bus.sent if is_clock(frame)]
     assert len(sent_s) == len(times) == state.frames
@@ -268,7 +268,7 @@ def test_recorded_timing_is_kept(
 def test_a_long_wait_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = QuietBus(monkeypatch)
     source = LogSource(short_log(40.0), Vehicle.load("generic"))
-    state = play(bus, source, ReplaySettings(0.001), stop=lambda: bus.now_s > 100.0)  # type: ignore[arg-type] # as above
+    state = play(bus, source, speed=0.001, stop=lambda: bus.now_s > 100.0)  # type: ignore[arg-type] # as above
     assert bus.now_s < 101.0
     assert state.log_seconds <= 0.2
 
@@ -276,7 +276,7 @@ def test_a_long_wait_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_estimate_does_not_depend_on_the_speed() -> None:
     log, model = short_log(40.0), leaf_model()
     with virtual_service("fast", REPLAYED) as service:
-        state = play_log("fast", 40.0, ReplaySettings(speed=40.0))
+        state = play_log("fast", 40.0, {"speed": 40.0})
         assert waits(lambda: service.pipeline.samples == 400)
     assert state.acknowledged is None
     sent = quantized(Vehicle.load("generic"), log)
@@ -288,8 +288,8 @@ def test_the_estimate_does_not_depend_on_the_speed() -> None:
 def test_a_loop_runs_until_stopped() -> None:
     with virtual_service("loop", REPLAYED) as service, virtual_port("loop", SOC_FRAMES) as port:
         source = LogSource(short_log(5.0), Vehicle.load("generic"))
-        settings = ReplaySettings(speed=math.inf, loop=True)
-        state = play(port, source, settings, stop=lambda: service.pipeline.samples >= 220)
+        settings = {"speed": math.inf, "loop": True}
+        state = play(port, source, **settings, stop=lambda: service.pipeline.samples >= 220)
         assert state.samples >= 220
         assert service.pipeline.counts.beginnings == 0
         assert service.rows[219][0] == pytest.approx(21.9)
@@ -300,14 +300,14 @@ def test_full_speed_needs_the_vehicle_of_a_capture(tmp_path: Path) -> None:
     with Recorder(path) as recorder:
         recorder.on_frame(can.Message(timestamp=1.0, arbitration_id=1, data=b"1"))
     with virtual_port("blind") as port, pytest.raises(InputError, match="--vehicle"):
-        play(port, CaptureSource(path), MAX, stop=never)
+        play(port, CaptureSource(path), **MAX, stop=never)
 
 
 def test_fd_frames_need_an_fd_bus(tmp_path: Path) -> None:
     path = tmp_path / "fd.log"
     path.write_text("(1.000000) can0 123##000112233445566778899AABB\n")
     with virtual_port("classic") as port, pytest.raises(InputError, match="fd=true"):
-        play(port, CaptureSource(path), ReplaySettings(), stop=never)
+        play(port, CaptureSource(path), stop=never)
 
 
 @pytest.mark.real
@@ -317,5 +317,5 @@ def test_a_real_leafs_capture_at_full_speed(shared_data: Path) -> None:
     with virtual_service("leaf", REPLAYED, vehicle=vehicle) as service:
         assert isinstance(service, Service)
         with virtual_port("leaf", SOC_FRAMES) as port:
-            state = play(port, CaptureSource(path, vehicle), MAX, stop=never)
+            state = play(port, CaptureSource(path, vehicle), **MAX, stop=never)
     assert state.acknowledged == state.samples > 100

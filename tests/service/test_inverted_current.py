@@ -16,7 +16,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.replay.player import ReplaySettings, play
+from cangauge.replay.player import play
 from cangauge.replay.steps import LogSource
 from cangauge.service.config import RunConfig
 from cangauge.service.pipeline import Pipeline
@@ -62,7 +62,7 @@ def test_an_inverted_drive_through_the_service(tmp_path: Path) -> None:
         running = threading.Thread(target=lambda: found.update(service.run()))
         running.start()
         source = LogSource(short_log(600.0, rate_hz=2.0), Vehicle.load("generic"))
-        state = play(port, source, ReplaySettings(speed=float("inf")), stop=never)
+        state = play(port, source, speed=float("inf"), stop=never)
         service.stop()
         running.join(30.0)
         logged.release_due(everything=True)

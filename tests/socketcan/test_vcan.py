@@ -8,6 +8,7 @@ import struct
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -22,7 +23,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.replay.player import ReplaySettings, play
+from cangauge.replay.player import play
 from cangauge.replay.steps import LogSource, quantization_bound
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -44,7 +45,7 @@ pytestmark = pytest.mark.socketcan
 
 VCAN = BusAddress("socketcan", "vcan0")
 SOC_FRAMES = [standard_filter(0x5A0), standard_filter(0x5A1)]
-MAX = ReplaySettings(speed=float("inf"), acknowledge_s=20.0)
+MAX: dict[str, Any] = {"speed": float("inf"), "acknowledge_s": 20.0}
 
 
 @pytest.fixture(autouse=True)
@@ -119,14 +120,14 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     estimator = EstimatorSettings(initial_soc_pct=80.0)
     settings = PipelineSettings(estimator, "replay-clock")
     with Recorder(path) as recorder, service("leaf_aze0", settings, recorder) as live:
-        state = play(replay_port, LogSource(log, vehicle), MAX, stop=never)
+        state = play(replay_port, LogSource(log, vehicle), **MAX, stop=never)
     assert state.acknowledged == len(live.rows) == len(log)
     assert live.pipeline.counts.lost == live.pipeline.counts.crc_errors == 0
     soc = np.array([estimate.soc_pct for _, estimate in live.rows])
     residual = np.array([estimate.residual_v for _, estimate in live.rows])
     offline = run_estimator(samples_of(log), leaf_model(), estimator)
     worst = float(np.max(np.abs(soc - offline.soc_pct)))
-    assert 0.0 < worst <= quantization_bound(vehicle, leaf_model(), log).ekf_pct
+    assert 0.0 < worst <= quantization_bound(vehicle, leaf_model(), log)["ekf"]
     recorded = estimate_capture(path, vehicle, leaf_model(), estimator)
     assert np.array_equal(recorded.table.soc_pct, soc)
     assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)
@@ -135,9 +136,7 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
 def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path: Path) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
     with Recorder(path) as recorder, service("generic", PipelineSettings(), recorder) as live:
-        state = play(
-            replay_port, LogSource(log, Vehicle.load("generic")), ReplaySettings(), stop=never
-        )
+        state = play(replay_port, LogSource(log, Vehicle.load("generic")), stop=never)
         assert waits(lambda: live.pipeline.samples == len(log))
     assert state.seconds == pytest.approx(6.0, abs=0.1)
     times = np.array([time_s for time_s, _ in live.rows])

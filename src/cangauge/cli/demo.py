@@ -99,7 +99,7 @@ def demo_command(
     estimate = RecordedEstimate(log, table, live, model, settings)
     page = extra("report.estimate:estimate_page")(estimate, paths["model"]).html()
     write_text_atomic(paths["soc_page"], page)
-    bound_pct = quantization_bound(Vehicle.load("generic"), model, log).ekf_pct
+    bound_pct = quantization_bound(Vehicle.load("generic"), model, log)["ekf"]
     result = {
         "log": "a reconstruction of the published 2012 Leaf test, no recording",
         "current_offset_a": SENSOR_OFFSET_A,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from datetime import UTC, datetime
 from functools import partial
-from operator import attrgetter
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -155,9 +155,10 @@ def _show_capture(found: CaptureInspection) -> None:
     if shown := ", ".join(f"{count:,} {words}" for words, count in counts.items() if count):
         say(f"{shown[0].upper()}{shown[1:]}.")
     if found.gaps:
-        gap = max(found.gaps, key=attrgetter("length_s"))
+        gap = max(found.gaps, key=itemgetter("length_s"))
         others = f", the longest of {len(found.gaps)}" if len(found.gaps) > 1 else ""
-        say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s{others}.")
+        after_s = gap["start_s"] - found.start_s
+        say(f"Silence of {gap['length_s']:.3g} s after {after_s:.1f} s{others}.")
     for line in info["remarks"] if found.log is None else ():  # the log's hold them
         say(f"Remarks: {line}")
     if found.log is not None:

@@ -96,7 +96,7 @@ def replay_command(
     from cangauge.bus.connection import BusConnection
     from cangauge.bus.open import open_bus
     from cangauge.bus.publish import standard_filter
-    from cangauge.replay.player import ReplaySettings, play
+    from cangauge.replay.player import play
     from cangauge.service.config import load_config
     from cangauge.service.lifecycle import stop_on_signals
     from cangauge.service.setup import address_of
@@ -106,7 +106,6 @@ def replay_command(
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
     stopped: list[bool] = []
     factor = math.inf if speed == "max" else speed
-    settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
     with ExitStack() as stack:
         stack.enter_context(stop_on_signals(partial(stopped.append, True)))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
@@ -120,7 +119,7 @@ def replay_command(
         def is_stopped() -> bool:
             return bool(stopped)
 
-        state = play(bus, source, settings, stop=is_stopped, show=show)
+        state = play(bus, source, stop=is_stopped, show=show, speed=factor, loop=loop, ids=ids)
     note(_line(state))
     if bus.unsent:
         note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")

@@ -166,7 +166,7 @@ def inspect_capture(
         remote_frames,
         time_reversals=int((steps_s < 0.0).sum()),
         ids=summaries,
-        gaps=tuple(Gap(stamps_s[at], float(steps_s[at])) for at in gaps),
+        gaps=tuple({"start_s": stamps_s[at], "length_s": float(steps_s[at])} for at in gaps),
         presets=_without_cold_relatives(trial.match(summaries, duration_s) for trial in best),
         log=None if vehicle is None else inspect_log(capture_to_log(path, vehicle)),
     )

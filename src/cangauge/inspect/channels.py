@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,21 +25,12 @@ VOLTAGE_SHARE: Final = 0.002
 
 
 @dataclass(frozen=True, slots=True)
-class Stuck:
-    """An interval in which a channel kept one value while the other one swung."""
-
-    start_s: float
-    duration_s: float
-    value: float
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
 class Channel:
     """One channel of a log; values in `unit`.
 
     `quantum` is the quantization step (None: there is none), `levels` the number of distinct
-    values, `missing` the rows without one.
+    values, `missing` the rows without one. `stuck` are the intervals in which the channel kept one
+    value while the other one swung: start and length [s], value, and why.
     """
 
     unit: str
@@ -49,7 +40,7 @@ class Channel:
     quantum: float | None
     levels: int
     missing: int
-    stuck: tuple[Stuck, ...] = ()
+    stuck: tuple[dict[str, Any], ...] = ()
 
 
 def describe_channels(log: Log, resistance_ohm: float | None) -> dict[str, Channel]:
@@ -77,7 +68,7 @@ def _described(values: FloatArray, unit: str) -> Channel:
 
 def _stuck(
     log: Log, current: Channel, voltage: Channel, resistance_ohm: float
-) -> tuple[tuple[Stuck, ...], tuple[Stuck, ...]]:
+) -> tuple[tuple[dict[str, Any], ...], tuple[dict[str, Any], ...]]:
     """Return the stuck intervals of current and voltage, by the detectors of the service."""
     pack = PackProperties(
         resistance_ohm,
@@ -104,11 +95,14 @@ def _stuck(
 
 def _intervals(
     time_s: FloatArray, values: FloatArray, is_stuck: BoolArray, why: str
-) -> tuple[Stuck, ...]:
+) -> tuple[dict[str, Any], ...]:
     """Return the intervals of one value that have a row recognised as stuck."""
     first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     last = np.append(first[1:], values.size) - 1
     hit = np.logical_or.reduceat(is_stuck, first)
     start_s, end_s, value = time_s[first[hit]], time_s[last[hit]], values[first[hit]]
     columns = start_s.tolist(), (end_s - start_s).tolist(), value.tolist()
-    return tuple(Stuck(*each, why) for each in zip(*columns, strict=True))
+    return tuple(
+        {"start_s": begin, "duration_s": length, "value": kept, "why": why}
+        for begin, length, kept in zip(*columns, strict=True)
+    )

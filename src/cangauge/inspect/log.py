@@ -53,12 +53,8 @@ WIDE_SOC_PCT: Final = 60.0
 SINGLE_ROW: Final = "too short: a single row, and charge is counted from one row to the next"
 
 
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """Time without rows: time of the last row before it, and its length [s]."""
-
-    start_s: float
-    length_s: float
+Gap = dict[str, float]
+"""Time without rows: time of the last row before it, and its length [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,28 +110,11 @@ class Soc:
 
 
 @dataclass(frozen=True, slots=True)
-class Resistance:
-    """Median and quartiles of −ΔU/ΔI over steps of current [Ω], of the current's right sign."""
-
-    median_ohm: float
-    lower_ohm: float
-    upper_ohm: float
-    steps: int
-
-
-@dataclass(frozen=True, slots=True)
-class Ability:
-    """Whether a log can identify something, and the reason with its figures."""
-
-    topic: str
-    verdict: Verdict
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class LogInspection:
     """Findings of `inspect_log`; `soc` is None without a reference, `resistance` without steps.
 
+    `resistance` has the median and the quartiles of −ΔU/ΔI over steps of current [Ω], of the
+    current's right sign. `abilities` say what the log can identify, and why, with figures.
     `contradiction` says that charge and SoC of the log contradict each other; else it is None.
     """
 
@@ -147,10 +126,10 @@ class LogInspection:
     channels: dict[str, Channel]
     charge: Charge
     soc: Soc | None
-    resistance: Resistance | None
+    resistance: dict[str, float] | None
     sign: SignFinding
     contradiction: str | None
-    abilities: tuple[Ability, ...]
+    abilities: dict[str, tuple[Verdict, str]]
     remarks: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -162,10 +141,10 @@ class LogInspection:
             return problem
         if self.sign.sign < 0:
             return f"{self.sign.sentence}; --sign charge inverts it"
-        assessed = {item.topic: item for item in self.abilities}
         for topic in ("rows for a fit", "voltage curve over SoC"):
-            if assessed[topic].verdict == "no":
-                return f"good for an estimate, not for a fit: {assessed[topic].text}"
+            verdict, text = self.abilities[topic]
+            if verdict == "no":
+                return f"good for an estimate, not for a fit: {text}"
         if self.soc is None:
             needed = "--capacity-ah and, of one log, --initial-soc"
             return f"good for an estimate; a fit needs {needed}, as the log has no SoC"
@@ -179,6 +158,10 @@ class LogInspection:
         """Return plain values for JSON."""
         plain = asdict(self)
         del plain["sign"]
+        plain["abilities"] = [
+            {"topic": topic, "verdict": verdict, "text": text}
+            for topic, (verdict, text) in self.abilities.items()
+        ]
         found = {"sign_of_current": self.sign.to_dict(), "answer": self.answer}
         return {"kind": "log", **plain, **found}
 
@@ -190,9 +173,9 @@ def inspect_log(log: Log) -> LogInspection:
     soc = _soc(log, sign, contradicts)
     charge = _charge(log, timing.gap_limit_s)
     resistance = _resistance(log, sign)
-    channels = describe_channels(log, resistance.median_ohm if resistance else None)
+    channels = describe_channels(log, resistance["median_ohm"] if resistance else None)
     warnings = tuple(_warnings(log, timing, channels, charge, sign))
-    assessed: dict[str, tuple[Verdict, str]] = {
+    abilities: dict[str, tuple[Verdict, str]] = {
         "sign of current": ("yes" if sign.sign else "no", sign.sentence),
         "voltage curve over SoC": _curve(charge, soc),
         "capacity": ("no", contradicts) if contradicts else _capacity(log, charge, soc),
@@ -203,7 +186,6 @@ def inspect_log(log: Log) -> LogInspection:
         "start from rest": _start(log, timing),
         "rest voltage": _rests(log),
     }
-    abilities = tuple(Ability(topic, *each) for topic, each in assessed.items())
     return LogInspection(
         log.name,
         log.source,
@@ -234,7 +216,7 @@ def channel_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
 
 def ability_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of what a log can identify."""
-    rows = [[item.topic, item.verdict, item.text] for item in found.abilities]
+    rows = [[topic, *ability] for topic, ability in found.abilities.items()]
     return ["quantity", "identifiable", "reason"], rows
 
 
@@ -255,7 +237,7 @@ def _timing(log: Log) -> Timing:
         limit_s,
         int(gaps.size),
         float(step[gaps].sum()),
-        tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
+        tuple({"start_s": float(time_s[i]), "length_s": float(step[i])} for i in longest),
     )
 
 
@@ -289,12 +271,15 @@ def _soc(log: Log, sign: SignFinding, contradicts: str | None) -> Soc | None:
     return Soc(soc.size / len(log), first, last, low, high, capacity_ah, std_ah)
 
 
-def _resistance(log: Log, sign: SignFinding) -> Resistance | None:
+def _resistance(log: Log, sign: SignFinding) -> dict[str, float] | None:
     current, voltage = current_steps(log)
     if current.size < MIN_STEPS:
         return None
     ohm = np.quantile(-voltage / current * (sign.sign or 1), [0.5, 0.25, 0.75]).tolist()
-    return Resistance(ohm[0], ohm[1], ohm[2], current.size) if ohm[0] > 0.0 else None
+    if ohm[0] <= 0.0:
+        return None
+    found = dict(zip(("median_ohm", "lower_ohm", "upper_ohm"), ohm, strict=True))
+    return {**found, "steps": current.size}
 
 
 # --- Warnings
@@ -316,7 +301,7 @@ def _warnings(
         longest = timing.longest_gaps[0]
         yield (
             f"{counted(timing.gap_count, 'gap')} of more than {rounded(timing.gap_limit_s, 2)} s,"
-            f" the longest {longest.length_s:.4g} s at {longest.start_s:.1f} s;"
+            f" the longest {longest['length_s']:.4g} s at {longest['start_s']:.1f} s;"
             f" {charge.in_gaps_ah:.3g} Ah are interpolated over gaps"
         )
     if charge.uncounted_gaps:
@@ -328,8 +313,8 @@ def _warnings(
     for name, channel in channels.items():
         for each in channel.stuck[:LISTED]:
             yield (
-                f"{name} stuck at {each.value:g} {channel.unit} for {each.duration_s:.0f} s from"
-                f" {each.start_s:.1f} s: {each.why}"
+                f"{name} stuck at {each['value']:g} {channel.unit} for {each['duration_s']:.0f} s"
+                f" from {each['start_s']:.1f} s: {each['why']}"
             )
     yield from (f"{n} never changes" for n in ("current_a", "voltage_v") if channels[n].levels == 1)
     if log.temperature_source == "room":
@@ -370,11 +355,11 @@ def _capacity(log: Log, charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
     return "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty"
 
 
-def _ohmic(resistance: Resistance | None, step_s: float) -> tuple[Verdict, str]:
+def _ohmic(resistance: dict[str, float] | None, step_s: float) -> tuple[Verdict, str]:
     if resistance is None:
         return "no", f"fewer than {MIN_STEPS} clear steps of current"
-    ohm, low, high = resistance.median_ohm, resistance.lower_ohm, resistance.upper_ohm
-    text = f"{ohm:.4g} Ω (quartiles {low:.4g} … {high:.4g}) from {resistance.steps} steps of"
+    ohm, low, high, steps = resistance.values()
+    text = f"{ohm:.4g} Ω (quartiles {low:.4g} … {high:.4g}) from {steps} steps of"
     verdict: Verdict = "yes" if abs(high - low) <= 0.5 * abs(ohm) else "partly"
     return verdict, f"{text} current over {step_s:.3g} s"
 

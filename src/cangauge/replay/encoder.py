@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from operator import attrgetter
+from operator import itemgetter
 from typing import Final
 
 import can
@@ -21,16 +20,6 @@ SLOW_EVERY_S: Final = 1.0
 """Longest interval at which temperature and SoC are sent without a change, in log time [s]."""
 
 _UNITS: Final = {"current": "A", "voltage": "V", "temperature": "°C", "soc_reference": "%"}
-
-
-@dataclass(slots=True)
-class _Outgoing:
-    """A frame to send: the signals of one message that share a payload."""
-
-    signals: list[VehicleSignal]
-    is_slow: bool
-    last: bytearray | None = None
-    last_s: float = -math.inf
 
 
 class FrameEncoder:
@@ -54,7 +43,9 @@ class FrameEncoder:
         for signal in vehicle.signals:
             groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
         keys = [key for key, _ in groups]
-        self._frames = []
+        # Signals of each frame in a payload of its own, and whether they are slow.
+        self._frames: list[tuple[list[VehicleSignal], bool]] = []
+        self._sent: dict[int, tuple[bytearray, float]] = {}
         for (key, _), signals in groups.items():
             is_slow = all(signal.role in {"temperature", "soc_reference"} for signal in signals)
             if not is_slow and keys.count(key) > 1:
@@ -62,8 +53,8 @@ class FrameEncoder:
                 source, where = vehicle.dbc_files[0], signals[0].message
                 cure = "replay as another --vehicle"
                 raise InputError(problem, source=source, field=where, cure=cure)
-            self._frames.append(_Outgoing(signals, is_slow))
-        self._frames.sort(key=attrgetter("is_slow"), reverse=True)
+            self._frames.append((signals, is_slow))
+        self._frames.sort(key=itemgetter(1), reverse=True)
 
     def encode(self, sample: Sample, soc_reference_pct: float = math.nan) -> list[can.Message]:
         """Return the frames of one sample, in sending order.
@@ -80,17 +71,18 @@ class FrameEncoder:
             "soc_reference": soc_reference_pct,
         }
         messages = []
-        for frame in self._frames:
-            if all(math.isnan(values[signal.role]) for signal in frame.signals):
+        for place, (signals, is_slow) in enumerate(self._frames):
+            if all(math.isnan(values[signal.role]) for signal in signals):
                 continue
-            first = frame.signals[0]
+            first = signals[0]
             payload = bytearray(first.length)
-            for signal in frame.signals:
+            for signal in signals:
                 signal.codec.encode_into(payload, values[signal.role])
-            if frame.is_slow:
-                if payload == frame.last and 0.0 <= time_s - frame.last_s < SLOW_EVERY_S:
+            if is_slow:
+                last, last_s = self._sent.get(place, (None, -math.inf))
+                if payload == last and 0.0 <= time_s - last_s < SLOW_EVERY_S:
                     continue
-                frame.last, frame.last_s = payload, time_s
+                self._sent[place] = payload, time_s
             rule = self.vehicle.messages[first.key].rule
             data = bytes(payload)
             if rule is not None:

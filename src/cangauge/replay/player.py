@@ -54,27 +54,6 @@ _HINT: Final = (
 )
 
 
-@dataclass(frozen=True)
-class ReplaySettings:
-    """Settings of a replay.
-
-    Parameters
-    ----------
-    speed : float
-        Log seconds per second; infinite: as fast as the receiver acknowledges.
-    loop : bool
-        Repeat until stopped.
-    acknowledge_s : float
-        Longest wait for a receiver, and for its acknowledgement, at full speed [s].
-    ids : FrameIds
-    """
-
-    speed: float = 1.0
-    loop: bool = False
-    acknowledge_s: float = 10.0
-    ids: FrameIds = field(default_factory=FrameIds)
-
-
 @dataclass
 class ReplayState:
     """Progress of a replay.
@@ -106,10 +85,13 @@ def _show_nothing(_state: ReplayState) -> None:
 def play(
     bus: BusConnection,
     source: Source,
-    settings: ReplaySettings,
     *,
     stop: Callable[[], bool],
     show: Callable[[ReplayState], None] = _show_nothing,
+    speed: float = 1.0,
+    loop: bool = False,
+    acknowledge_s: float = 10.0,
+    ids: FrameIds | None = None,
 ) -> ReplayState:
     """Play a source on a bus.
 
@@ -118,11 +100,18 @@ def play(
     bus : BusConnection
         Needs to receive SOC_ESTIMATE and SOC_DETAIL only.
     source : Source
-    settings : ReplaySettings
     stop : callable
         Called between frames; True ends the replay.
     show : callable, optional
         Called a few times a second, and at the end.
+    speed : float
+        Log seconds per second; infinite: as fast as the receiver acknowledges.
+    loop : bool
+        Repeat until stopped.
+    acknowledge_s : float
+        Longest wait for a receiver, and for its acknowledgement, at full speed [s].
+    ids : FrameIds, optional
+        Of the receiver's frames, and of the clock.
 
     Raises
     ------
@@ -132,7 +121,7 @@ def play(
     CangaugeError
         If the bus fails, or no receiver acknowledges in time.
     """
-    player = _Player(bus, settings, stop)
+    player = _Player(bus, ids or FrameIds(), speed, acknowledge_s, stop)
     if player.is_max:
         if not source.counts_samples:
             raise InputError(
@@ -144,7 +133,7 @@ def play(
             )
         player.wait_until(player.is_ready)
     show_s = -math.inf
-    for step in source.steps(loop=settings.loop):
+    for step in source.steps(loop=loop):
         if stop():
             break
         player.send(step)
@@ -189,13 +178,18 @@ class _Player:
     """Sends steps when they are due, or when the receiver has room; keeps the state."""
 
     def __init__(
-        self, bus: BusConnection, settings: ReplaySettings, stop: Callable[[], bool]
+        self,
+        bus: BusConnection,
+        ids: FrameIds,
+        speed: float,
+        acknowledge_s: float,
+        stop: Callable[[], bool],
     ) -> None:
-        self._bus, self._within_s, self._stop = bus, settings.acknowledge_s, stop
-        self.is_max = math.isinf(settings.speed)
-        self._pacer = Pacer(settings.speed, stop, self._listen_once)
-        self._sends_clock, self._clock_id = settings.speed != 1.0, settings.ids.replay_clock
-        self._reader = SocReader(settings.ids)
+        self._bus, self._within_s, self._stop = bus, acknowledge_s, stop
+        self.is_max = math.isinf(speed)
+        self._pacer = Pacer(speed, stop, self._listen_once)
+        self._sends_clock, self._clock_id = speed != 1.0, ids.replay_clock
+        self._reader = SocReader(ids)
         self._first_us: int | None = None
         self._began_s, self._clock_us = 0.0, -1
         self._count: int | None = None  # in the latest SOC_DETAIL

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -31,7 +30,7 @@ from cangauge.logs.gaps import usual_step_s
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.settings import FrameIds
+from cangauge.settings import FrameIds, Method
 from cangauge.types import Sample
 
 _CAPTURE_LOOP_GAP_US = 10_000
@@ -159,35 +158,22 @@ Source = LogSource | CaptureSource
 """A recording to replay."""
 
 
-@dataclass(frozen=True)
-class QuantizationBound:
-    """Largest SoC error due to the quantization of frames [%], by method.
+def quantization_bound(
+    vehicle: Vehicle, model: Model, log: Log, capacity_ah: float | None = None
+) -> dict[Method, float]:
+    """Return the largest SoC error due to the quantization of frames [%], by method.
 
-    Values in frames differ from the log's by at most half a step (δI, δU, δT; δt = 0.5 µs).
-    Through the model::
+    For a log replayed as a vehicle's frames with REPLAY_CLOCK. Values in frames differ from the
+    log's by at most half a step (δI, δU, δT; δt = 0.5 µs). Through the model::
 
-        counting   ≤ 100/(3600·C) · (δI·t + δt·Σ|ΔI|)
-        Newton     ≤ (δU + |kt|·δT + Σ|Rj|·(δI + δt·max|dI/dt|)) / min dU/dS
-        EKF        ≤ counting + Newton
+        coulomb  ≤ 100/(3600·C) · (δI·t + δt·Σ|ΔI|)
+        newton   ≤ (δU + |kt|·δT + Σ|Rj|·(δI + δt·max|dI/dt|)) / min dU/dS
+        ekf      ≤ coulomb + newton
 
     The last because a filter moves the counted SoC towards that of the voltage by less than their
     difference: the error stays below the larger of the two plus the counting error in between. It
     holds as long as no threshold (outlier, persistent contradiction) is decided differently.
     """
-
-    coulomb_pct: float
-    newton_pct: float
-
-    @property
-    def ekf_pct(self) -> float:
-        """For the EKF."""
-        return self.coulomb_pct + self.newton_pct
-
-
-def quantization_bound(
-    vehicle: Vehicle, model: Model, log: Log, capacity_ah: float | None = None
-) -> QuantizationBound:
-    """Return the bound for a log replayed as a vehicle's frames with REPLAY_CLOCK."""
     step = FrameEncoder(vehicle).quantization()
     voltage_model = model.voltage_model()
     current_a = step["current_a"]
@@ -203,4 +189,5 @@ def quantization_bound(
     volts = step["voltage_v"] + abs(voltage_model.loads.kt_v_per_k) * temperature_k
     volts += resistance * (current_a + time_s * slew)
     slope = min(voltage_model.pseudo_ocv_at(soc)[1] for soc in np.linspace(0.0, 100.0, 1001))
-    return QuantizationBound(coulomb, volts / slope)
+    newton = volts / slope
+    return {"coulomb": coulomb, "newton": newton, "ekf": coulomb + newton}

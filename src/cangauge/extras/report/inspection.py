@@ -26,7 +26,7 @@ def inspect_page(found: LogInspection, log: Log) -> Page:
     charged = f"charged {significant(charge.charged_ah, 4, 'Ah')}"
     tiles = [Tile("Discharged", significant(charge.discharged_ah, 4, "Ah"), charged)]
     if found.resistance is not None:
-        median = significant(found.resistance.median_ohm, 3, "Ω")
+        median = significant(found.resistance["median_ohm"], 3, "Ω")
         tiles.append(Tile("Resistance", median, "median of steps of current"))
     if soc is not None:
         ends = f"{soc.first_pct:.1f} → {soc.last_pct:.1f} %"
