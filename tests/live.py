@@ -290,7 +290,7 @@ class Command:
             env={**os.environ, "COLUMNS": "200"},
             start_new_session=True,  # without a terminal, as systemd starts it
         )
-        self._stderr: list[str] = []
+        self.lines: list[str] = []
 
     def wait_for(self, text: str, seconds: float = PATIENCE_S) -> None:
         """Wait for a text on stderr; a process that never writes it is killed."""
@@ -299,12 +299,12 @@ class Command:
         deadline.start()
         try:
             for line in self.process.stderr:
-                self._stderr.append(line)
+                self.lines.append(line)
                 if text in line:
                     return
         finally:
             deadline.cancel()
-        raise AssertionError(f"ended without {text!r}: {''.join(self._stderr)}")
+        raise AssertionError(f"ended without {text!r}: {''.join(self.lines)}")
 
     def end(self, seconds: float = PATIENCE_S) -> Ended:
         try:
@@ -312,8 +312,8 @@ class Command:
         except subprocess.TimeoutExpired:
             self.process.kill()
             out, err = self.process.communicate()
-            raise AssertionError(f"did not end: {''.join(self._stderr)}{err}") from None
-        return Ended(self.process.returncode, out, "".join(self._stderr) + err)
+            raise AssertionError(f"did not end: {''.join(self.lines)}{err}") from None
+        return Ended(self.process.returncode, out, "".join(self.lines) + err)
 
 
 def run_to_end(*arguments: object, seconds: float = PATIENCE_S) -> Ended:

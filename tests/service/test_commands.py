@@ -52,7 +52,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     service = Command("run", "--config", config, "--json")
     service.wait_for("service.ready")
     service.wait_for("http.listening")
-    http_port = json.loads(service._stderr[-1])["port"]
+    http_port = json.loads(service.lines[-1])["port"]
     replayed = in_process("replay", log, "--config", config, "--speed", "max", "--json")
     assert replayed.code == 0, replayed.err
     assert replayed.json["acknowledged"] == replayed.json["samples"] == 1200

@@ -20,7 +20,7 @@ from watched import StandInPort, Watched
 from cangauge.cli.status import live_text, status_values
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.cells import CellReport
-from cangauge.service.run import _COUNTED, Service
+from cangauge.service.run import COUNTED, log_end
 from cangauge.service.status import Histogram
 from cangauge.service.status_client import (
     BOUNDS_S,
@@ -30,7 +30,7 @@ from cangauge.service.status_client import (
     find_socket,
     socket_path,
 )
-from live import Command, LoggedLines, in_process, leaf_model_path, waits
+from live import Command, LoggedLines, in_process, waits
 
 
 @pytest.fixture
@@ -65,12 +65,11 @@ def test_a_status_is_plain_json_of_what_the_loop_counted(watched: Watched) -> No
 
 def test_the_end_of_a_run_says_what_was_counted(watched: Watched) -> None:
     counts = {"unsent": 1, "losses": 0, "foreign": 25}
-    service = Service(model=str(leaf_model_path()))
     with LoggedLines("cangauge.service.run") as logged:
-        service._log_end(watched.status | {"bus_counts": counts, "recording": None})
+        log_end(watched.status | {"bus_counts": counts, "recording": None})
     text = "0 CRC errors, 1 frames not sent, 25 frames of another service with these ids; last SoC"
     assert text in logged.lines[0]
-    assert counts.keys() | watched.status["bus_counts"].keys() == _COUNTED.keys()
+    assert counts.keys() | watched.status["bus_counts"].keys() == COUNTED.keys()
 
 
 def test_before_the_first_sample_the_soc_is_not_known_yet() -> None:

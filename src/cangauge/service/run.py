@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, closing
 from functools import partial
@@ -31,7 +31,7 @@ from cangauge.service.status import Monitor
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
 from cangauge.service.worker import start_thread
 
-_COUNTED: Final = {
+COUNTED: Final = {
     "garbled": "packets that are no frames",
     "error_frames": "error frames",
     "unsent": "frames not sent",
@@ -185,7 +185,7 @@ class Service:
         recording = None if self.recorder is None else str(self.recorder.written)
         used_s = {"cpu_seconds": time.process_time() - began_s}
         status = monitor.final() | used_s | {"recording": recording}
-        self._log_end(status)
+        log_end(status)
         return status
 
     def _is_done(self) -> bool:
@@ -216,13 +216,17 @@ class Service:
         if self._reading is None:
             if self._is_reload_due:
                 self._is_reload_due = False
-                self._reading = Future()
+                reading: Future[Setup | CangaugeError] = Future()
+                self._reading = reading
                 monitor.reload_begins()
-                read = partial(_put_setup, self._read, self._reading)
+
+                def read() -> None:
+                    reading.set_result(read_setup(self._read))
+
                 try:
                     start_thread(read, "cangauge-reload")
                 except CangaugeError as error:
-                    self._reading.set_result(error)
+                    reading.set_result(error)
             return None
         if not self._reading.done():
             return None
@@ -232,33 +236,29 @@ class Service:
         monitor.reload_ends(problem)
         return self.config if problem is None else None
 
-    def _log_end(self, status: dict[str, Any]) -> None:
-        """Log the end of a run: its frames, losses and last SoC, and what is missing."""
-        counts, last = self.pipeline.counts, self.pipeline.published
-        step_s = status["step"]["mean_s"]
-        errors = "".join(
-            f", {count} {_COUNTED.get(name, name)}"
-            for name, count in status["bus_counts"].items()
-            if count
-        )
-        text = (
-            f"{status['uptime_s']:.1f} s, {counts.frames} frames, {counts.samples} samples,"
-            f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors};"
-            f" last SoC {known_soc(last.soc_pct, last.soc_std_pct, 2)}"
-            f" ({last.status.name.lower()});"
-            f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
-        )
-        emit(_LOG, logging.INFO, "service.stopped", text)
-        if not counts.frames:
-            text = f"{self.bus}: no expected frame arrived; check channel, bit rate and vehicle"
-            text += " (--vehicle or --map)"
-            emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
-        if (path := status["recording"]) is not None:
-            emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
 
-
-def _put_setup(read: Callable[[], RunConfig], into: Future[Setup | CangaugeError]) -> None:
-    into.set_result(read_setup(read))
+def log_end(status: Mapping[str, Any]) -> None:
+    """Log the end of a run by its status: frames, losses and last SoC, and what is missing."""
+    frames, estimate, step_s = status["frames"], status["estimate"], status["step"]["mean_s"]
+    errors = "".join(
+        f", {count} {COUNTED.get(name, name)}"
+        for name, count in status["bus_counts"].items()
+        if count
+    )
+    text = (
+        f"{status['uptime_s']:.1f} s, {frames['received']} frames, {status['samples']} samples,"
+        f" {frames['lost']} lost, {status['rejects']['crc_errors']} CRC errors{errors};"
+        f" last SoC {known_soc(estimate['soc_pct'], estimate['soc_std_pct'], 2)}"
+        f" ({status['status']});"
+        f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
+    )
+    emit(_LOG, logging.INFO, "service.stopped", text)
+    if not frames["received"]:
+        text = f"{status['bus']}: no expected frame arrived; check channel, bit rate and vehicle"
+        text += " (--vehicle or --map)"
+        emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
+    if (path := status["recording"]) is not None:
+        emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
 
 
 def _check_files(config: RunConfig, state: Path | None) -> None:
