@@ -393,38 +393,24 @@ def candump_frame(
     )
 
 
-class PatternReader(LineReader):
-    """Reader of a format whose frames all match one `pattern`; lines of `other` state none."""
-
-    pattern: ClassVar[re.Pattern[str]]
-    other: ClassVar[re.Pattern[str] | None] = None
-
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        match = self.pattern.match(line)
-        if match is None and not (self.other and self.other.match(line)):
-            raise ValueError("not a frame")
-        return None if match is None else self._frame(*match.groups())
-
-    @abstractmethod
-    def _frame(self, *groups: Any) -> can.Message:
-        """Return the frame of the groups of the pattern."""
-
-
-class CandumpLogReader(PatternReader):
+class CandumpLogReader(LineReader):
     """Log file of candump -l; python-can's reader stops at a malformed line."""
 
     name = "candump log"
     states_length = False
     keeps_dates = True
     # (1436509052.249713) vcan0 044#2A366C2BBA
-    pattern = re.compile(
+    _PATTERN: Final = re.compile(
         r"\((\d+\.\d+)\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
         r"(?:(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)|R(\d?))(?: ([RT]))?\s*$"
     )
 
-    def _frame(self, *groups: Any) -> can.Message:
-        time, channel, number, fd_flags, data, remote, way = groups
+    def parse(self, line: str) -> can.Message | None:
+        """Return the frame of a line."""
+        match = self._PATTERN.match(line)
+        if match is None:
+            raise ValueError("not a frame")
+        time, channel, number, fd_flags, data, remote, way = match.groups()
         flags = int(fd_flags[1], 16) if fd_flags else 0
         return candump_frame(
             time,

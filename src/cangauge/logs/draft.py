@@ -181,9 +181,10 @@ class DraftLog:
         elif "temperature_c" not in self.values:
             found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
             cure = "give a constant: --temperature 25"
-            likely = [text for text in self.ignored if _may_be_temperature(text)]
-            if likely:
-                cure = f"name its column: --columns 'temperature={likely[0]}'"
+            for text in reversed(self.ignored):
+                meaning = meaning_of(text)
+                if meaning and (meaning.quantity, meaning.rank) == ("temperature", Rank.GUESS):
+                    cure = f"name its column: --columns 'temperature={text}'"
             raise self.error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
     def _drop_incomplete(self) -> None:
@@ -257,9 +258,3 @@ class DraftLog:
         """Return the error for a column, by its canonical name or, of others, its heading."""
         label = self.labels.get(name, name)
         return InputError(problem, source=self.where, field=label, value=value, cure=cure)
-
-
-def _may_be_temperature(heading: str) -> bool:
-    """Return whether a heading is a temperature that only the user can confirm."""
-    meaning = meaning_of(heading)
-    return bool(meaning and meaning.quantity == "temperature" and meaning.rank == Rank.GUESS)

@@ -139,23 +139,20 @@ class LogFile:
     ) -> Log:
         """Read the log; arguments and errors as of `cangauge.read_log`."""
         require_temperature(temperature_c)
+        reader = self.reader
+        if reader is None:
+            raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
         try:
-            if self.reader is None:
-                raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
-            draft = self._draft(self.reader)
+            draft = reader.read(self.head, self.columns)
             draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
             log = draft.log(temperature_c, temperature_source, self.sign)
+        except UnknownColumnsError as error:
+            raise proposing(error, partial(self.reads, reader)) from error
         except MemoryError as error:
             problem, cure = "larger than the free memory", "split it"
             raise InputError(problem, source=self.head.path, cure=cure) from error
         pa.default_memory_pool().release_unused()
         return log
-
-    def _draft(self, reader: LogReader) -> DraftLog:
-        try:
-            return reader.read(self.head, self.columns)
-        except UnknownColumnsError as error:
-            raise proposing(error, partial(self.reads, reader)) from error
 
     def reads(self, reader: LogReader, columns: ColumnMap) -> bool:
         """Return whether a reader makes a log of the file's beginning by these columns."""

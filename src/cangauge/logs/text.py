@@ -59,12 +59,15 @@ class TextTable(NamedTuple):
         """
         data = as_utf8(self.head.read())
         width = self._width(places)
-        kinds = self._kinds(places)
-        try:
-            table, odd_rows = self._read(data, width, kinds)
-        except pa.ArrowInvalid:  # a cell that is no bare number: read the spellings
-            kinds = dict.fromkeys(kinds, pa.string())
-            table, odd_rows = self._read_text(data, width, kinds)
+        # A cell that is no bare number: all columns are read again as they are spelled.
+        for kinds in (self._kinds(places), dict.fromkeys(places, pa.string())):
+            try:
+                table, odd_rows = self._read(data, width, kinds)
+                break
+            except pa.ArrowInvalid as error:
+                reason = str(error).splitlines()[0]
+        else:
+            raise self._error(f"the table cannot be read: {reason}", "export it again")
         self._remark_odd(odd_rows, table.num_rows)
         if table.num_rows > MAX_ROWS:
             raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
@@ -113,15 +116,6 @@ class TextTable(NamedTuple):
             strings_can_be_null=True,
         )
         return pacsv.read_csv(pa.BufferReader(data), how, rows, cells), odd_rows
-
-    def _read_text(
-        self, data: bytes, width: int, kinds: Mapping[int, Any]
-    ) -> tuple[Any, list[Any]]:
-        try:
-            return self._read(data, width, kinds)
-        except pa.ArrowInvalid as error:
-            problem = f"the table cannot be read: {str(error).splitlines()[0]}"
-            raise self._error(problem, "export it again") from error
 
     def _values(self, cells: Any, place: int) -> Any:
         """Return cells, null where a restarted logger wrote its header again."""
