@@ -24,12 +24,9 @@ SHORTEST_S: Final = 300.0
 LEAST_PART, MOST_PART = 0.7, 1.4
 """Limits of a log's median voltage relative to the pack's usual voltage."""
 
-MOST_COUNTED_PCT: Final = 150.0
-"""Span of the counted SoC that a wrong capacity or current gain explains at most [%]: their
-physical bounds are a third of the value."""
-
-COUNT_TOLERANCE_PCT: Final = 5.0
-"""A count this far beyond 0–100 % is no contradiction [%]."""
+MOST_COUNTED_PCT, COUNT_TOLERANCE_PCT = 150.0, 5.0
+"""Span of the counted SoC that a wrong capacity or current gain explains at most, as their physical
+bounds are a third of the value; and how far it may lie beyond 0–100 % without contradiction [%]."""
 
 
 def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> None:

@@ -36,12 +36,9 @@ from cangauge.model.model_file import Model, as_model
 
 _LOG = logging.getLogger(__name__)
 
-WORSE_SOC_PCT = 0.25
+WORSE_SOC_PCT, SETTLING_S = 0.25, 300.0
 """A correction is refused if the SoC error of these logs grows by more with it [%]: on healthy
-trips of one car it scatters by as much."""
-
-SETTLING_S = 300.0
-"""Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
+trips of one car it scatters by as much. The first seconds, with withheld start, do not count."""
 
 
 @dataclass(frozen=True, eq=False)

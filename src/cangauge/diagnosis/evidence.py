@@ -18,12 +18,9 @@ from cangauge.model.model_file import Model
 VISIBLE_NATS: Final = 6.0
 """Evidence from which an effect counts as visible [nats]: 400 to 1 for one effect."""
 
-TWO_SIDED: Final = 1.96
-"""Standard deviations of a 95 % interval."""
-
-SHAPE_STD: Final = 0.05
-"""Relative uncertainty of a size by the shape, which is the library's and not the pack's: on
-development cases with much evidence sizes were off by 1 to 15 %."""
+TWO_SIDED, SHAPE_STD = 1.96, 0.05
+"""Standard deviations of a 95 % interval, and the relative uncertainty of a size by its shape: it
+is the library's and not the pack's, and sizes of development cases were off by 1 to 15 %."""
 
 Places = tuple[float | None, ...]
 """Where a shape begins in each log, in parts of it: 0 is from its first row on, None never."""

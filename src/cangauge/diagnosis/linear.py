@@ -63,6 +63,17 @@ class Linear:
         """Number of coefficients."""
         return N + 2 + self.ohm.size
 
+    @property
+    def coefficients(self) -> FloatArray:
+        """Curve at the knots [V], temperature [V/K], resistances [Ω] and Arrhenius' part."""
+        loads = self.model.model.loads
+        now = np.zeros(self.p)
+        now[:N] = self.model.model.curve.values(KNOTS_PCT)
+        now[N] = loads.kt_v_per_k
+        now[N + 1 : N + 1 + len(loads.resistance_ohm)] = loads.resistance_ohm
+        now[-1] = 0.0 if loads.arrhenius is None else loads.arrhenius.factor
+        return now
+
     def columns(self, of: Simulated) -> FloatArray:
         """Return the change of voltage by each coefficient on the rows of a log, shape (m, p)."""
         true, rows = of.plain.signals, of.of.rows
@@ -83,7 +94,6 @@ class Linear:
         self, model: Model, mean_v: float, mean_soc_pct: float
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the change of the coefficients by the chemistry's prior."""
-        voltage = self.model.model
         pack = PackPrior(CHEMISTRIES[model.chemistry], model.capacity_ah)
         known = pack.coefficients(mean_v, mean_soc_pct)
         number = self.ohm.size
@@ -92,13 +102,7 @@ class Linear:
         mean, covariance = known.coefficients[kept], known.covariance[np.ix_(kept, kept)].copy()
         later = slice(first + 1, first + number)
         covariance[later, later] = np.diag(np.diag(covariance[later, later]))
-        now = np.zeros_like(mean)
-        now[:N] = voltage.curve.values(KNOTS_PCT)
-        loads = voltage.loads
-        now[N] = loads.kt_v_per_k
-        now[first : first + len(loads.resistance_ohm)] = loads.resistance_ohm
-        now[-1] = 0.0 if loads.arrhenius is None else loads.arrhenius.factor
-        return mean - now, covariance
+        return mean - self.coefficients, covariance
 
     def stated(self, model: Model) -> FloatArray:
         """Return the covariance of the coefficients that the model file itself states."""
@@ -117,18 +121,15 @@ class Linear:
     def moved(self, change: FloatArray) -> Linear:
         """Return the model with other coefficients."""
         voltage, loads = self.model.model, self.model.model.loads
-        ohm = np.zeros(self.ohm.size)
-        ohm[: len(loads.resistance_ohm)] = loads.resistance_ohm
-        values = voltage.curve.values(KNOTS_PCT) + change[:N]
-        factor = 0.0 if loads.arrhenius is None else loads.arrhenius.factor
+        now = self.coefficients + change
         changed = Loads(
             t_ref_c=loads.t_ref_c,
-            kt_v_per_k=float(loads.kt_v_per_k + change[N]),
+            kt_v_per_k=float(now[N]),
             delays_s=loads.delays_s,
             low_pass_s=self.low_pass_s,
-            resistance_ohm=tuple((ohm + change[N + 1 : -1]).tolist()),
-            arrhenius=Arrhenius(float(factor + change[-1]), tuple(self.ohm.tolist()), self.mean_c),
+            resistance_ohm=tuple(now[N + 1 : -1].tolist()),
+            arrhenius=Arrhenius(float(now[-1]), tuple(self.ohm.tolist()), self.mean_c),
         )
-        curve = HermiteCurve.rising(KNOTS_PCT, values)
+        curve = HermiteCurve.rising(KNOTS_PCT, now[:N])
         corrected = replace(voltage, curve=curve, loads=changed)
         return replace(self, model=replace(self.model, model=corrected))

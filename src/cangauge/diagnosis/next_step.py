@@ -12,8 +12,6 @@ from cangauge.diagnosis.posterior import Posterior
 
 RESOLUTION: Final = 0.025
 """Resolution of a measurement without a healthy scatter, in bounds of the effect."""
-NODES: Final = 7
-"""Readings over which an expectation is taken (Gauss–Hermite)."""
 
 
 def next_step(
@@ -40,7 +38,7 @@ def _expected(
     of = evidence[next(iter(posterior.effects(measured)))]
     resolution = of.shape.usual or RESOLUTION * of.shape.bound
     spread = float(np.hypot(resolution, of.std))
-    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
     now = np.array([posterior.faults[fault] for fault in posterior.stated])
     after = []
     for fault in posterior.stated:

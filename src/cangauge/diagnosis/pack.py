@@ -54,12 +54,10 @@ which the search for it begins."""
 RIDGE: Final = 4.0
 """Prior precision of an amplitude in units of its larger bound."""
 
-SOC_SCATTER, SOC_RESOLUTION_PCT = 0.02, 0.7
-"""Usual scatter of counted charge over the change of a log's own SoC [-], and the resolution of
-such a SoC [%]: that of a start."""
-SOC_STANDS_OUT: Final = 3.0
-"""Standard deviations from which a log's own SoC is evidence: below, a gauge may count with the
-faulty sensor itself."""
+SOC_SCATTER, SOC_RESOLUTION_PCT, SOC_STANDS_OUT = 0.02, 0.7, 3.0
+"""Usual scatter of counted charge over the change of a log's own SoC [-]; resolution of such a SoC
+[%], that of a start; and the standard deviations from which it is evidence: below, a gauge may
+count with the faulty sensor itself."""
 
 UNTESTED_EXCESS: Final = 22.0
 """Excess of an effect's evidence where fewer than two references show it: nine of ten effects stay

@@ -38,10 +38,9 @@ UNKNOWN: Final = "unknown"
 
 FAULTS: Final[tuple[str, ...]] = get_args(FaultName)
 
-ALARM: Final = 0.05
-"""Probability of `none` up to which a gap is reported."""
-LIKELY: Final = 0.2
-"""Probability of `none` up to which a gap is called likely: odds of 4 to 1."""
+ALARM, LIKELY = 0.05, 0.2
+"""Probability of `none` up to which a gap is reported, and up to which it is called likely: odds of
+4 to 1."""
 
 ALIKE: Final = {
     "level of the voltage": ("voltage_reading", "start", "slow_voltage"),

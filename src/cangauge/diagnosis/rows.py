@@ -18,14 +18,12 @@ from cangauge.model.effects.library import shape_key
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import DELAYS_S
 
-STEP_S: Final = 0.9
-"""Logs with a shorter step are averaged over seconds [s]; a logger of 1 Hz jitters."""
+STEP_S, MOST_SECONDS = 0.9, 60.0
+"""Logs with a shorter step are averaged over seconds; a logger of 1 Hz jitters. A row stands for at
+most the latter time, as in a fit [s]."""
 
 LEAST_ROWS: Final = 60
 """A log with fewer rows after the delay line has filled is used as a whole."""
-
-MOST_SECONDS: Final = 60.0
-"""A row stands for at most this time [s], as in a fit."""
 
 COVER_PCT: Final = 2.0
 """Logs cover SoC this far beyond their own [%]."""

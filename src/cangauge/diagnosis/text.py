@@ -19,16 +19,13 @@ if TYPE_CHECKING:
     from cangauge.diagnosis.diagnose import Diagnosis
     from cangauge.diagnosis.model_check import ModelCheck
 
-SLOW_S: Final = 10.0
-"""Interval of rows that no longer follow the load: the shortest memory of both equations [s]."""
-SHORT_S: Final = 600.0
-"""Duration below which slow effects hardly develop [s]."""
+SLOW_S, SHORT_S = 10.0, 600.0
+"""Interval of rows that no longer follow the load, the shortest memory of both equations; and the
+duration below which slow effects hardly develop [s]."""
 LEAST_REFERENCES: Final = 3
 """References from which on probabilities are reliable."""
-SHOWN_FROM: Final = 0.02
-"""Probability from which a fault is listed."""
-MOST_SHOWN: Final = 3
-"""Faults that a sentence lists."""
+SHOWN_FROM, MOST_SHOWN = 0.02, 3
+"""Probability from which a sentence lists a fault, and how many it lists."""
 SHOWN_VISIBLE: Final = ("voltage_offset", "current_offset", "resistance_growth")
 """Effects whose smallest visible size is told where there is no gap: what a user suspects first."""
 

@@ -12,19 +12,16 @@ import numpy as np
 from cangauge._text import number
 from cangauge._typing import FloatArray, IntArray
 
-REST_C_RATE: Final = 0.02
-"""Current below which the pack rests [1/h]."""
-LONG_REST_S: Final = 300.0
-"""A rest from which on what comes after it counts as after a rest [s]."""
+REST_C_RATE, LONG_REST_S = 0.02, 300.0
+"""Current below which the pack rests [1/h], and the rest from which on what comes after it counts
+as after a rest [s]."""
 AFTER_REST_MIN: Final = (0.0, 10.0, 30.0)
 """Edges of the time since the last long rest [min]; the last interval is open."""
 
-PIECE_S: Final = 300
-"""Length of the pieces that a bootstrap draws, beyond the correlation of errors [s]."""
-DRAWS: Final = 400
-"""Draws of a bootstrap; its quantiles vary by one per cent."""
-LEAST_PIECES: Final = 3
-"""Pieces with rows in an interval from which on its error is told apart: two always agree."""
+PIECE_S, LEAST_PIECES, DRAWS = 300, 3, 400
+"""Bootstrap: length of the pieces that it draws, beyond the correlation of errors [s]; pieces with
+rows in an interval from which on its error is told apart, as two always agree; and draws, by which
+quantiles vary by one per cent."""
 DIFFERENT: Final = 1.3
 """Smallest ratio of errors that counts as a difference: a third is visible in a plot."""
 
