@@ -67,7 +67,7 @@ def status_command(
 
     `cangauge status --watch`
 
-    `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
+    `cangauge status --endpoint /run/cangauge/can0/socketcan-can0.sock --json`
     """
     from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hmac
 import json
 import logging
-import socket
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -59,14 +59,19 @@ class Site(Output):
     ----------
     address : HttpAddress
         Its token is needed by requests.
-    listening : socket
-        Bound to it.
+    title : str
+        Of the pages, with "{}" for the address, to log where they are.
     routes : dict
         Pages by patterns of their paths.
     elsewhere : str
         Answer of all other paths.
     **limits
         Of tornado's `HTTPServer`.
+
+    Raises
+    ------
+    InputError
+        If the address cannot be bound.
 
     Attributes
     ----------
@@ -79,7 +84,7 @@ class Site(Output):
     def __init__(
         self,
         address: HttpAddress,
-        listening: socket.socket,
+        title: str,
         routes: Routes,
         elsewhere: str,
         **limits: Any,
@@ -96,9 +101,14 @@ class Site(Output):
             websocket_ping_interval=PING_S,
             websocket_max_message_size=MAX_BODY_BYTES,
         )
+        listening = address.listen()
         listening.setblocking(False)
         sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
         _Server(application, **sizes, **limits).add_socket(listening)
+        port = listening.getsockname()[1]
+        access = "without a token" if self.token is None else "with a token"
+        text = f"{title.format(replace(address, port=port))}, {access}"
+        emit(_LOG, logging.INFO, f"{address.key}.listening", text, port=port)
 
     def check_token(self, header: str, peer: str, wrong_at_most: int) -> bool:
         """Return whether an Authorization header bears the token; takes the same time for each.
@@ -128,11 +138,11 @@ def _log_nothing(_handler: RequestHandler) -> None:
 class StatusServer(Site):
     """Serve snapshots; `latest` is None before the first."""
 
-    def __init__(self, address: HttpAddress, listening: socket.socket) -> None:
+    def __init__(self, address: HttpAddress) -> None:
         self.latest: Snapshot | None = None
         super().__init__(
             address,
-            listening,
+            "status: http://{}/status",
             {"/(status|healthz|metrics)": (StatusPage, True), ".*": (Nothing, True)},
             "available: /status, /healthz, /metrics",
             no_keep_alive=True,

@@ -13,14 +13,12 @@ import signal
 import sys
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from pathlib import Path
-from socket import socket
 from typing import Final
 
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError
-from cangauge.extras.live.addresses import HttpAddress, http_addresses
+from cangauge.extras.live.addresses import http_addresses
 from cangauge.service.config import RunConfig
 from cangauge.service.events import logging_to, release_held
 from cangauge.service.output import Output
@@ -56,26 +54,16 @@ def outputs_of(config: RunConfig, bus: str) -> list[Output]:
     if (address := addresses.get("http")) is not None:
         from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
 
-        outputs.append(StatusServer(address, _listen(address, "status: http://{}/status")))
+        outputs.append(StatusServer(address))
     if (address := addresses.get("dashboard")) is not None:
         from cangauge.extras.live.server import LivePage  # noqa: PLC0415
 
-        outputs.append(LivePage(address, _listen(address, "live page: http://{}/")))
+        outputs.append(LivePage(address))
     if config.mqtt is not None:
         from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
 
         outputs.append(MqttPublisher(config.mqtt, bus))
     return outputs
-
-
-def _listen(address: HttpAddress, text: str) -> socket:
-    """Return a listening socket, and log where it is."""
-    listening = address.listen()
-    port = listening.getsockname()[1]
-    text = text.format(replace(address, port=port))
-    token = "with a token" if address.token else "without a token"
-    emit(_LOG, logging.INFO, f"{address.key}.listening", f"{text}, {token}", port=port)
-    return listening
 
 
 def serve(endpoint: Path, config: RunConfig) -> None:

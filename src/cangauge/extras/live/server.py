@@ -15,7 +15,6 @@ import secrets
 import time
 from contextlib import suppress
 from pathlib import Path
-from socket import socket
 from typing import Any, Final
 
 from bokeh.resources import Resources
@@ -39,16 +38,9 @@ _TYPES: Final = {"js": "text/javascript; charset=utf-8", "css": "text/css; chars
 
 
 class LivePage(Site):
-    """Serve the page on the running loop; a viewer must know the token.
+    """Serve the page on the running loop; a viewer must know the token."""
 
-    Parameters
-    ----------
-    address : HttpAddress
-    listening : socket
-        Bound to it.
-    """
-
-    def __init__(self, address: HttpAddress, listening: socket) -> None:
+    def __init__(self, address: HttpAddress) -> None:
         self._turn = asyncio.Lock()
         self.history = History()
         self.id = secrets.token_hex(8)
@@ -62,7 +54,7 @@ class LivePage(Site):
             self.cookie = hmac.new(key, b"cangauge live page", hashlib.sha256).hexdigest()
         super().__init__(
             address,
-            listening,
+            "live page: http://{}/",
             {
                 "/(enter)?": (Entrance, False),
                 r"/files/([a-z.]+)": (StaticFile, False),
