@@ -72,8 +72,8 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
         assert vehicle.fixed_temperature_c is None
     else:
         assert (vehicle.fixed_temperature_c, vehicle.temperature_source) == (20.0, "unknown")
-    cells = () if vehicle.cells is None else vehicle.cells.keys
-    assert set(vehicle.messages) == {*(signal.key for signal in vehicle.signals), *cells}
+    signals = (*vehicle.signals, *vehicle.cells)
+    assert set(vehicle.messages) == {signal.key for signal in signals}
     assert len(vehicle.filters) == len(vehicle.wanted_ids)
     assert vehicle.pair_within_s == 0.020
 

@@ -31,10 +31,6 @@ from cangauge.errors import InputError, closest, located
 MAX_DBC_BYTES: Final = 4 * MIB
 """Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
 
-_FEW_CODES: Final = 4
-"""Values at the upper end of a range from which on they are no codes for "not available", of which
-signals have up to three."""
-
 Decode = Callable[[bytes | bytearray], float]
 
 _CONVERTED: Final = {".arxml", ".kcd", ".sym"}
@@ -226,7 +222,7 @@ class SignalCodec:
         return raw
 
     def wrapped_bits(self, values: FloatArray) -> int | None:
-        """Return the bits of a signed number that these values are, if they are read unsigned.
+        """Return the width of the signed number that these values are, if they are read unsigned.
 
         They lie at both ends of its range, where the number wraps at zero, and none in its middle
         half. It may have a bit less than the signal.
@@ -240,7 +236,7 @@ class SignalCodec:
             is_apart = ((raw < quarter) | (raw >= top - quarter)).all() and (raw < quarter).any()
             if (
                 is_apart
-                and len(negative) >= _FEW_CODES
+                and len(negative) > 3  # signals have up to three codes for "not available"
                 and negative[-1] < top <= negative[-1] + top / 32
             ):
                 return bits

@@ -1,8 +1,8 @@
-"""The text of a DBC before cantools reads it: what would take too long, and what it would refuse.
+"""Repair the text of a DBC for cantools, and refuse what would take it minutes.
 
-cantools keeps a table of signals for each way through nested multiplexers. It refuses a file for
-one line about a signal that is gone, and for an extended id without its flag; many files in use
-have both.
+cantools keeps a table of signals for each path through nested multiplexers. It refuses a file for
+one line about a missing signal, and for an extended id without its flag; many files in use have
+both.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ _RANGE: Final = re.compile(r"(?<!\d)(\d++)\s*+[-+](\d++)")
 
 
 def prepared(text: str, path: Path) -> tuple[str, list[str]]:
-    """Return the text of a DBC as cantools reads it, and what was changed in it.
+    """Return the text of a DBC as cantools reads it, and a remark on each change.
 
-    Lines about signals that are gone are left out, and ids of more than 11 bits get the flag of
-    extended ones. Raises InputError for a text that would take gigabytes or minutes.
+    Lines about missing signals are left out, and ids of more than 11 bits get the flag of extended
+    ones. Raises InputError for a text that would take gigabytes or minutes.
     """
     remarks = []
     bare = _without_content(text)

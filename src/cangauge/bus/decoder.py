@@ -12,9 +12,10 @@ import can
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.bus.database import SignalCodec
+from cangauge.bus.database import BitField, SignalCodec
 from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
+from cangauge.bus.mapping import CellsMap
 from cangauge.bus.plausibility import (
     MessageStatistics,
     PackProperties,
@@ -23,7 +24,7 @@ from cangauge.bus.plausibility import (
     stuck_detectors,
 )
 from cangauge.bus.protection import FrameChecker, Verdict
-from cangauge.bus.vehicle import CellSignals, Vehicle, VehicleSignal, pgn_mask
+from cangauge.bus.vehicle import Vehicle, VehicleSignal, pgn_mask
 from cangauge.types import Reason, Sample
 
 _MISSING: Final = {
@@ -104,20 +105,20 @@ class Pairing:
 class CellVoltages:
     """Voltages of the cells, each used once."""
 
-    def __init__(self, signals: CellSignals) -> None:
-        self._signals = signals
+    def __init__(self, cells: CellsMap, group: int, index: BitField | None) -> None:
+        self._cells, self._group, self._index = cells, group, index
         self._forget()
 
     def _forget(self) -> None:
-        self._voltage_v = [math.nan] * self._signals.count
-        self._time_s = [math.nan] * self._signals.count
+        self._voltage_v = [math.nan] * self._cells.count
+        self._time_s = [math.nan] * self._cells.count
 
     def take(self, now_s: float) -> tuple[list[float], list[float]]:
         """Return voltages [V] and bus times [s] that came since the last call and are not old.
 
         The others are NaN.
         """
-        oldest_s = now_s - self._signals.timeout_s
+        oldest_s = now_s - self._cells.timeout_s
         voltage_v, time_s = self._voltage_v, self._time_s
         for place, at_s in enumerate(time_s):
             if at_s < oldest_s:
@@ -126,18 +127,18 @@ class CellVoltages:
         return voltage_v, time_s
 
     def read(
-        self, cells: Sequence[tuple[int, SignalCodec]], payload: bytearray, time_s: float
+        self, signals: Sequence[tuple[int, SignalCodec]], payload: bytearray, time_s: float
     ) -> None:
         """Read the cells (place and codec of each) of a payload at bus time `time_s` [s]."""
-        shift, signals = 0, self._signals
-        if signals.index is not None:
-            shift = (signals.index.get(payload) - signals.first_index) * len(signals.cells)
-        for place, codec in cells:
+        shift, cells = 0, self._cells
+        if self._index is not None:
+            shift = (self._index.get(payload) - cells.first_index) * self._group
+        for place, codec in signals:
             at = place + shift
             # The last group may be filled up.
-            if 0 <= at < signals.count and codec.is_in(payload):
+            if 0 <= at < cells.count and codec.is_in(payload):
                 volts = codec.decode(payload)
-                if signals.lowest_v <= volts <= signals.highest_v:
+                if cells.lowest <= volts <= cells.highest:
                     self._voltage_v[at], self._time_s[at] = volts, time_s
 
 
@@ -283,10 +284,10 @@ class SampleDecoder:
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
         self.cells: CellVoltages | None = None
-        if vehicle.cells is not None:
-            self.cells = CellVoltages(vehicle.cells)
-            for place, cell in enumerate(vehicle.cells.cells):
-                self._route(cell).cells.append((place, cell.codec))
+        if vehicle.cells_map is not None:
+            self.cells = CellVoltages(vehicle.cells_map, len(vehicle.cells), vehicle.cell_index)
+        for place, cell in enumerate(vehicle.cells):
+            self._route(cell).cells.append((place, cell.codec))
         self._current, self._voltage = self.health["current"], self.health["voltage"]
         self._latest_a: deque[float] = deque(maxlen=1000)  # 10 s of a fast message
         self._temperature = self.health.get("temperature")

@@ -220,8 +220,8 @@ _FIELDS_OF_PROFILES: Final = (
 class VehicleMap(_MapTable):
     """Content of a map file.
 
-    `dbc` are files relative to it. The temperature may be given as an
-    option; `soc_reference` (also: `soc`) is the car's own state of charge. `columns` are those of
+    `dbc` are files relative to it. The temperature may be given as an option; `soc_reference`
+    (also: `soc`) is the car's own state of charge. `columns` are those of
     the car's logs that are tables (`logs.column_map.ColumnMap`). `pair_within_s` is the largest
     distance in bus time between paired current and voltage [s]. Messages go by name or id.
     """

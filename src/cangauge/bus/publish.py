@@ -41,7 +41,7 @@ ACKNOWLEDGE_EVERY: Final = 4
 
 
 class PackReport(NamedTuple):
-    """What is published every second besides the estimate; without cells: none have voltages."""
+    """Content of the frames of every second; `cells` is None without cell voltages."""
 
     health: Health
     power: Power
@@ -49,7 +49,7 @@ class PackReport(NamedTuple):
 
     @property
     def notices(self) -> list[str]:
-        """What the user should look after, one sentence each."""
+        """Advice for the user, one sentence each."""
         cells = self.cells
         if cells is None or not cells.is_sum_wrong:
             return []

@@ -25,8 +25,6 @@ the bus and the next attempt are lost; the longest is below the gap that empties
 STEADY_S: Final = 5.0
 """A bus lost after this time in use [s] is retried after the first pause; one that flaps keeps its
 pause."""
-REPORT_AFTER_S: Final = 1.0
-"""Time without a bus after which failed attempts are logged [s]: a short outage needs one line."""
 
 Opener = Callable[[BusAddress, Sequence[CanFilter] | None], can.BusABC]
 
@@ -161,7 +159,7 @@ class ReconnectingBus(BusConnection):
         except Exception as error:  # noqa: BLE001 - drivers raise anything
             self._schedule_attempt()
             away_s = time.monotonic() - self._since_s
-            if away_s >= REPORT_AFTER_S:
+            if away_s >= LONGEST_PAUSE_S:  # a short outage needs one line
                 reason = str(error) or type(error).__name__
                 text = f"away for {away_s:.0f} s ({reason}); retrying"
                 self._log("bus.away", logging.WARNING, text)

@@ -78,7 +78,7 @@ def read_log(
         Columns of a table: {"current": "I_batt[mA]:-1"} or "time=t,current=I_batt[mA]:-1"; heading,
         unit and factor. What it leaves out is found by plain headings.
     sign : {"charge", "discharge"}, optional
-        What a positive current in a log does; by default as the format defines it, or found from
+        Effect of a positive current in a log; by default as the format defines it, or found from
         the data.
 
     Returns
@@ -149,7 +149,7 @@ def open_recording(
     """Open a file as a log or a capture, recognised by its beginning; InputError if neither.
 
     `columns` are the user's: the file is then a table. `mapped` are a map file's, for tables of no
-    known format. `sign` is what a positive current in a log does.
+    known format. `sign` is the effect of a positive current in a log.
     """
     path = as_path(path)
     capture = open_capture(path) if columns is None and parts_of_run(path) else None

@@ -126,7 +126,7 @@ class StampLimiter:
         return now_s - self._unusable_s < CERTAIN_AFTER_S and lasting_s >= UNCERTAIN_AFTER_S
 
     def _replaced(self, stamp_s: float, now_s: float) -> float:
-        """Return the time for a stamp outside the interval [s]."""
+        """Return the time that replaces a stamp outside the interval [s]."""
         if math.isnan(self.offset_s):
             self.offset_s = (stamp_s if abs(stamp_s) <= LATEST_S else 0.0) - now_s
             return now_s + self.offset_s

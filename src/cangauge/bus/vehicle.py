@@ -79,30 +79,6 @@ class VehicleSignal:
         return bool(self.key & EXTENDED)
 
 
-@dataclass(frozen=True, slots=True)
-class CellSignals:
-    """Voltages of all cells in series: `count` cells, the first of number `first`.
-
-    `cells` are one a cell, in order; with `index`, the raw number of the group in a frame, those of
-    one group, and `first_index` is the number of the first group. Voltages are plausible within
-    `lowest_v` and `highest_v` [V], and not known beyond the age `timeout_s` [s].
-    """
-
-    count: int
-    first: int
-    cells: tuple[VehicleSignal, ...]
-    index: BitField | None
-    first_index: int
-    lowest_v: float
-    highest_v: float
-    timeout_s: float
-
-    @property
-    def keys(self) -> tuple[int, ...]:
-        """Keys of the messages, each once."""
-        return tuple(dict.fromkeys(cell.key for cell in self.cells))
-
-
 class MessageProtection(NamedTuple):
     """Protection and period [s] of one message, where known, and how it is identified.
 
@@ -124,8 +100,9 @@ class Vehicle:
     `voltage_accuracy_pct` is the standard deviation of the voltage sensor's lasting error [%].
     `fixed_temperature_c` is the temperature where no signal has it [°C]. `pair_within_s` is the
     largest distance in bus time between paired current and voltage [s]. `messages` has every
-    message with a wanted signal, by key (id, plus `EXTENDED`). `remarks` say what of the DBC files
-    is read otherwise than it is written.
+    message with a wanted signal, by key (id, plus `EXTENDED`). `cells` are the cell voltages that
+    `cells_map` states: one signal per cell, or those of one group, numbered in a frame by
+    `cell_index`. `remarks` list deviations from the DBC files as written.
     """
 
     name: str
@@ -139,7 +116,9 @@ class Vehicle:
     messages: dict[int, MessageProtection]
     dbc_files: tuple[str, ...]
     voltage_accuracy_pct: float = VOLTAGE_ACCURACY_PCT
-    cells: CellSignals | None = None
+    cells: tuple[VehicleSignal, ...] = ()
+    cell_index: BitField | None = None
+    cells_map: CellsMap | None = None
     remarks: tuple[str, ...] = ()
 
     @classmethod
@@ -216,7 +195,7 @@ class Vehicle:
 
     @property
     def battery(self) -> str:
-        """What a SoC belongs to: messages, bits and sign of current and voltage."""
+        """Identity of the battery: messages, bits and sign of current and voltage."""
         parts = []
         for key, codec in ((each.key, each.codec) for each in (self.current, self.voltage)):
             pages = [(field, sorted(values)) for field, values in codec.conditions]
@@ -227,8 +206,7 @@ class Vehicle:
     @property
     def frame_keys(self) -> tuple[int, ...]:
         """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
-        keys = [signal.key for signal in self.signals]
-        keys += () if self.cells is None else self.cells.keys
+        keys = [signal.key for signal in (*self.signals, *self.cells)]
         ids = (reply_id(key) if self.messages[key].reply else key for key in keys)
         return tuple(dict.fromkeys(ids))
 
@@ -239,7 +217,7 @@ class Vehicle:
 
     @property
     def poll_targets(self) -> list[PollTarget]:
-        """The replies that may be asked for."""
+        """Replies to request, where the map states a request id."""
         return [
             PollTarget(each.request_id, reply_id(key), each.reply)
             for key, each in self.messages.items()
@@ -285,6 +263,7 @@ class _Binder:
         if not 0.0 <= within_s <= 1.0:
             raise InputError("must be within 0–1 s", field="pair_within_s", value=within_s)
         temperature, fixed_c = mapping.temperature, temperature_c
+        cells = self._cells(mapping.cells)
         if temperature is not None and fixed_c is None:
             fixed_c = temperature.fixed_c
         return Vehicle(
@@ -292,7 +271,9 @@ class _Binder:
             current=self._signal("current", mapping.current),
             voltage=self._signal("voltage", mapping.voltage),
             voltage_accuracy_pct=mapping.voltage.accuracy_pct,
-            cells=None if mapping.cells is None else self._cells(mapping.cells),
+            cells=cells,
+            cell_index=self._cell_index(mapping.cells, cells),
+            cells_map=mapping.cells,
             temperature=self._optional("temperature", temperature if fixed_c is None else None),
             soc_reference=self._optional("soc_reference", mapping.soc_reference),
             fixed_temperature_c=fixed_c,
@@ -303,25 +284,21 @@ class _Binder:
             remarks=tuple(self._remarks),
         )
 
-    def _cells(self, wanted: CellsMap) -> CellSignals:
-        cells = tuple(self._signal("cells", each) for each in wanted.signal_maps())
-        index: BitField | None = None
-        if wanted.index is not None:
-            if len({(cell.key, cell.codec.conditions) for cell in cells}) > 1:
-                problem = "the signals of a group are not in the same frame"
-                raise InputError(problem, source=self._source, field="cells.signals")
-            numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
-            index = self._signal("cells", numbering).codec.field
-        return CellSignals(
-            wanted.count,
-            wanted.first,
-            cells,
-            index,
-            wanted.first_index,
-            wanted.lowest,
-            wanted.highest,
-            wanted.timeout_s,
-        )
+    def _cells(self, wanted: CellsMap | None) -> tuple[VehicleSignal, ...]:
+        maps = [] if wanted is None else wanted.signal_maps()
+        return tuple(self._signal("cells", each) for each in maps)
+
+    def _cell_index(
+        self, wanted: CellsMap | None, cells: Sequence[VehicleSignal]
+    ) -> BitField | None:
+        """Return the bits of a group's number; its signals share the frame."""
+        if wanted is None or wanted.index is None:
+            return None
+        if len({(cell.key, cell.codec.conditions) for cell in cells}) > 1:
+            problem = "the signals of a group are not in the same frame"
+            raise InputError(problem, source=self._source, field="cells.signals")
+        numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
+        return self._signal("cells", numbering).codec.field
 
     def _in_first(
         self, find: Callable[..., _T], field: str, *names: str | int | None

@@ -180,12 +180,10 @@ _Rule = tuple[Protection, int]
 
 def _rules_of(vehicle: Vehicle) -> dict[tuple[int, bool], _Rule]:
     """Return the stated protections by id, and whether it is extended."""
-    cells = () if vehicle.cells is None else vehicle.cells.cells
-    signals = [(each, vehicle.messages[each.key].rule) for each in (*vehicle.signals, *cells)]
     return {
         (each.arbitration_id, each.is_extended): (rule, each.length)
-        for each, rule in signals
-        if rule is not None
+        for each in (*vehicle.signals, *vehicle.cells)
+        if (rule := vehicle.messages[each.key].rule) is not None
     }
 
 

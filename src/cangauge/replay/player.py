@@ -34,16 +34,13 @@ _LOG = logging.getLogger(__name__)
 
 AHEAD_S: Final = 0.0002
 """Frames due within this time are sent at once: sleeping is less precise [s]."""
-REST_AT_MOST_S: Final = 0.2
-"""Longest uninterrupted wait, so that a stop is noticed [s]."""
 WINDOW_FRAMES: Final = 160
 """Most frames in flight: a default socket buffer of Linux holds about 270."""
-SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
-"""Samples that may always be in flight: fewer would not trigger an acknowledgement."""
 LOST_AFTER_S: Final = 1.0
 """Time for which the receiver reports the same count in the silence after which the samples in
 flight are lost [s]: a socket buffer has dropped their frames."""
 POLL_S: Final = 0.05
+"""Longest uninterrupted wait, so that a stop is noticed [s]."""
 SHOW_EVERY_S: Final = 0.2
 LISTEN_S: Final = 0.001
 """Time to listen at each display update, for replays without pauses [s]."""
@@ -171,7 +168,7 @@ class Pacer:
         first_us, first_s = self._origin
         due_s = first_s + (time_us - first_us) / self._us_per_s
         while (ahead_s := due_s - time.monotonic()) > AHEAD_S and not self._stop():
-            self._rest(min(ahead_s, REST_AT_MOST_S))
+            self._rest(min(ahead_s, POLL_S))
 
 
 class _Player:
@@ -272,7 +269,7 @@ class _Player:
     @property
     def _frames_in_flight(self) -> int:
         """Frames that may wait at the receiver; 0 with too few samples for an acknowledgement."""
-        has_enough = len(self.in_flight) >= SAMPLES_AT_LEAST
+        has_enough = len(self.in_flight) >= 2 * ACKNOWLEDGE_EVERY
         return sum(self.in_flight) + self._incomplete if has_enough else 0
 
     def wait_until(self, is_enough: Callable[[], bool]) -> None:

@@ -281,7 +281,7 @@ class Pipeline:
         self._begin_cells()
 
     def _begin_cells(self) -> None:
-        cells, model = self.vehicle.cells, self.estimator.voltage_model
+        cells, model = self.vehicle.cells_map, self.estimator.voltage_model
         self.cells = None if cells is None else CellEstimator(model, cells.count, cells.first)
 
     # --- estimates → frames
@@ -458,7 +458,7 @@ def _with_sensors(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSet
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
     published = ids.published | {ids.replay_clock: "replay_clock"}
-    for signal in (*vehicle.signals, *(vehicle.cells.cells if vehicle.cells else ())):
+    for signal in (*vehicle.signals, *vehicle.cells):
         if signal.key in published:  # the key of an extended id is no standard id
             raise InputError(
                 f"{signal.message} of {vehicle.name} has this id",
