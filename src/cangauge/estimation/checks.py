@@ -1,4 +1,4 @@
-"""What samples show without the filter: impossible values, a wrong sign, and SoC references.
+"""Checks beside the filter: impossible values, a wrong sign, another pack, and SoC references.
 
 A reference is a moment at which the SoC is known by other means than counting and the filter: the
 end of a full charge, or a long rest. Both rules are off by default.
@@ -9,9 +9,19 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from scipy.special import chdtri
+
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorMemory
+from cangauge.model.extended import OnlineModel
+from cangauge.model.prior import SLOW_S
 from cangauge.types import TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason, Sample
+
+REST_CURRENT_C_RATE: Final = 0.02
+"""Below this current the pack is at rest [1/h]: 1.2 A at 60 Ah."""
+
+REST_S: Final = 600.0
+"""Interval without samples that counts as rest [s]: slow polarisation has decayed."""
 
 STEP_C_RATE: Final = 0.05
 """Least change of the current between rows that shows its sign [1/h]: 3 A at 60 Ah."""
@@ -25,6 +35,32 @@ STEPS_AT_LEAST: Final = 6.0
 STEPS_CORRELATION: Final = 0.9
 """Correlation from which the current has the wrong sign [-]. With the right one it is −0.5 or less
 in all recorded drives; a skew of one to five seconds between both gives up to 0.9."""
+
+
+MISMATCH_S: Final = 2.0 * SLOW_S
+"""Time over which innovations are tested against the model, and for which a failed test makes the
+estimate invalid [s]: twice the memory of the voltage's slow error."""
+
+ALARM: Final = 1e-6
+"""Probability that the innovations of a pack that agrees with its model fail the test."""
+
+
+def mismatch_limits(model: OnlineModel) -> tuple[int, float, float]:
+    """Return how far a pack may be from its model.
+
+    Returns
+    -------
+    blocks : int
+        Number of blocks tested together.
+    innovations : float
+        Largest sum of the squares of their normalised innovations.
+    strain : float
+        Largest `SocFilter.strain`: its mean under the model, less where the logs of the fit stayed
+        below it.
+    """
+    blocks = max(round(MISMATCH_S / model.noise.block_s), 1)
+    strain = (model.functions.number + 4.0) * model.noise.left_out_strain
+    return blocks, float(chdtri(blocks, ALARM)), strain
 
 
 def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
@@ -86,7 +122,7 @@ def detect_references(
     found, full, rest = [], settings.full_charge, settings.long_rest
     if full is not None and not math.isnan(sample.voltage_v):  # a missing voltage proves nothing
         is_high = sample.voltage_v >= full.voltage_v and abs(sample.current_a) <= full.current_a
-        memory.full_since_s = since(memory.full_since_s, is_high, sample.time_s)
+        memory.full_since_s = _since(memory.full_since_s, is_high, sample.time_s)
         was, memory.is_full = memory.is_full, sample.time_s - memory.full_since_s >= full.hold_s
         if memory.is_full and not was:
             found.append((full.soc_pct, full.soc_std_pct))
@@ -98,7 +134,15 @@ def detect_references(
     return found
 
 
-def since(start_s: float, holds: bool, now_s: float) -> float:
+def track_rest(memory: EstimatorMemory, sample: Sample, seconds: float, capacity_ah: float) -> None:
+    """Note since when the pack rests; an interval without samples [s] may be a rest too."""
+    is_rest = abs(sample.current_a) <= REST_CURRENT_C_RATE * capacity_ah
+    memory.rest_since_s = _since(memory.rest_since_s, is_rest, sample.time_s)
+    if seconds > REST_S:
+        memory.rest_since_s = sample.time_s - seconds
+
+
+def _since(start_s: float, holds: bool, now_s: float) -> float:
     """Return since when a condition has held [s], given the time so far; NaN: it does not."""
     if not holds:
         return math.nan

@@ -16,13 +16,12 @@ from dataclasses import asdict, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
+from cangauge.estimation import checks
 from cangauge.estimation.cells import PackTick
-from cangauge.estimation.checks import detect_references, drop_implausible, since, watch_sign
 from cangauge.estimation.counting import (
     UNKNOWN_INTERRUPTION_S,
     UNKNOWN_STD_PCT,
@@ -40,7 +39,6 @@ from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
-from cangauge.model.prior import SLOW_S
 from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import (
     CURRENT_AT_MOST_A,
@@ -54,21 +52,8 @@ from cangauge.types import (
     status_of,
 )
 
-REST_CURRENT_C_RATE: Final = 0.02
-"""Below this current the pack is at rest [1/h]: 1.2 A at 60 Ah."""
-
-REST_S: Final = 600.0
-"""Interval without samples that counts as rest [s]: slow polarisation has decayed."""
-
 CONTRADICTED_S: Final = 300.0
 """How long a rejected hypothesis, or a restart of the filter, degrades the estimate [s]."""
-
-MISMATCH_S: Final = 2.0 * SLOW_S
-"""Time over which innovations are tested against the model, and for which a failed test makes the
-estimate invalid [s]: twice the memory of the voltage's slow error."""
-
-ALARM: Final = 1e-6
-"""Probability that the innovations of a pack that agrees with its model fail the test."""
 
 
 class Estimator:
@@ -128,10 +113,7 @@ class Estimator:
         self._block = BlockState()
         self._memory = EstimatorMemory()
         self._power = PowerModel(self.online, self.settings.limits)
-        tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
-        # Its mean under the model, less where the logs of the fit stayed far below it.
-        strain_at_most = (self.online.functions.number + 4.0) * self.model.noise.left_out_strain
-        self.tests = tested, float(chdtri(tested, ALARM)), strain_at_most
+        self.tests = checks.mismatch_limits(self.online)
         of_model, of_input = self.model.temperature_source, self.settings.temperature_source
         is_same = "unknown" in {of_model, of_input} or of_model == of_input
         self.always = Reason.NONE if is_same else Reason.TEMPERATURE_SOURCE_MISMATCH
@@ -167,7 +149,7 @@ class Estimator:
         if time_s is None:
             return
         memory, stamp_s = self._memory, sample.time_s
-        sample, implausible = drop_implausible(
+        sample, implausible = checks.drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         if memory.samples == 0:
@@ -259,10 +241,7 @@ class Estimator:
         self.online.advance(time_s, current_a, memory.temperature_c)
         if seconds > self.settings.gap_s:
             self._note_gap(time_s)
-        is_rest = abs(current_a) <= REST_CURRENT_C_RATE * self.capacity_ah
-        memory.rest_since_s = since(memory.rest_since_s, is_rest, time_s)
-        if seconds > REST_S:
-            memory.rest_since_s = time_s - seconds
+        checks.track_rest(memory, sample, seconds, self.capacity_ah)
         tick = math.floor((time_s - memory.first_s) * self.model.rate_hz + 1e-6)
         if tick > memory.tick:
             memory.tick = tick
@@ -310,13 +289,13 @@ class Estimator:
                     online.drives,
                 )
             )
-            watch_sign(memory, sample, self.capacity_ah)
+            checks.watch_sign(memory, sample, self.capacity_ah)
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
             memory.voltage_model_v = online.pseudo_ocv_at(soc_pct)[0] + load_v
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
-        for reference in detect_references(self.settings, memory, sample):
+        for reference in checks.detect_references(self.settings, memory, sample):
             self._correct(*reference)
 
     def _close_block(self, time_s: float) -> None:
@@ -352,7 +331,7 @@ class Estimator:
         memory.innovations = innovations[-blocks:]
         is_lasting = sum(memory.innovations) > innovations_at_most
         if is_lasting or likelier.strain() > strain_at_most:
-            memory.mismatch_until_s = time_s + MISMATCH_S
+            memory.mismatch_until_s = time_s + checks.MISMATCH_S
         if is_lasting:
             # The model may be right and the SoC wrong: charge that was not seen.
             memory.innovations = []
