@@ -222,7 +222,7 @@ def _stepped(fmu: Any, time_s: float) -> float:
 
 
 def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(shutil, "which", lambda _name: None)
+    monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match="no C compiler"):
         export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
     assert list(tmp_path.iterdir()) == []

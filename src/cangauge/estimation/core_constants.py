@@ -12,7 +12,7 @@ from typing import Any, Final, get_args
 from cangauge.estimation.estimator import Estimator
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.extended import OnlineModel
-from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
+from cangauge.model.voltage_model import HermiteCurve, PublishedCurve
 from cangauge.settings import Method
 
 KINDS: Final = (
@@ -130,7 +130,7 @@ def model_constants(estimator: Estimator, forms: list[CoreForm]) -> Constants:
         constants |= {
             "has_arrhenius": 1,
             "arrhenius_ohm": arrhenius.resistance_ohm,
-            "arrhenius_mean": float(resistance_factor(arrhenius.mean_c)),
+            "arrhenius_mean": arrhenius.warm,
         }
     return constants
 

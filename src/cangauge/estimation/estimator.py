@@ -274,9 +274,10 @@ class Estimator:
             ocv_v = sample.voltage_v - load_v
             newton = soc_from_ocv(online.pseudo_ocv_at, ocv_v, guess_pct)
             memory.newton_pct, memory.newton_inside = newton
-            memory.newton_std_pct = inverse_std_pct(
-                online, memory.newton_pct, self._temperature_c, load
-            )
+            if self.settings.method == "newton":  # no other method asks for it
+                memory.newton_std_pct = inverse_std_pct(
+                    online, memory.newton_pct, self._temperature_c, load
+                )
             self._block.add(
                 Block(
                     counter.counted_s,

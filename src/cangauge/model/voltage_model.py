@@ -416,6 +416,11 @@ class Arrhenius:
     resistance_ohm: tuple[Value, ...]
     mean_c: Celsius
 
+    @cached_property
+    def warm(self) -> float:
+        """Factor a(T̄)."""
+        return float(resistance_factor(self.mean_c))
+
 
 class Loads(Fields):
     """Temperature coefficient and resistances of a voltage model, as its file states them."""
@@ -520,7 +525,7 @@ class VoltageModel:
         bounded = np.clip(np.asarray(temperature_c, dtype=np.float64), *self.temperature_limits_c)
         columns = [np.atleast_1d(bounded)[:, None] - self.loads.t_ref_c, currents_a]
         if (arrhenius := self.loads.arrhenius) is not None:
-            colder = resistance_factor(bounded) / resistance_factor(arrhenius.mean_c) - 1.0
+            colder = resistance_factor(bounded) / arrhenius.warm - 1.0
             drop = currents_a @ np.array(arrhenius.resistance_ohm)
             columns.append((colder * drop)[:, None])
         return np.concatenate(columns, axis=1)
