@@ -531,7 +531,9 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         cg_sum *sums = state->block.sums;
         memory->newton_pct = cg_newton(self, sample->voltage_v - state->load_v, guess_pct,
                                        &memory->newton_inside);
-        memory->newton_std_pct = inverse_std_pct(self, memory->newton_pct, temperature_c);
+        if (self->settings.method == (int32_t)CG_NEWTON) { /* no other method asks for it */
+            memory->newton_std_pct = inverse_std_pct(self, memory->newton_pct, temperature_c);
+        }
         const cg_real scalars[4] = {
             sample->voltage_v, memory->temperature_c, state->drop_v,
             cg_square(unseen_v_per_a(model)) * state->counter.turned_a2,
