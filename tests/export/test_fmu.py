@@ -15,7 +15,6 @@ from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.fmu import Kind, export_fmu
-from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample
@@ -85,7 +84,7 @@ def pack_voltage(model: Model, initial_soc_pct: float) -> list[float]:
     for time_s, current_a, temperature_c in zip(
         TIME_S.tolist(), held(CURRENT_A), held(TEMPERATURE_C), strict=True
     ):
-        (now,) = online.correct(Reading(time_s, current_a, float("nan"), temperature_c))
+        (now,) = online.correct(Sample(time_s, current_a, float("nan"), temperature_c))
         if volts:
             out_ah += 0.5 * (now.current_a + last) / 3600.0
         last = now.current_a
