@@ -372,7 +372,7 @@ def written_name(path: str | PathLike[str]) -> Path:
     """Return the file that writing to `path` replaces.
 
     Links of this user and of root are followed. The name of another user's link is returned
-    itself: writing replaces the link, not the file to which it points.
+    itself, as that of a link to itself: writing replaces the link.
 
     Raises
     ------
@@ -394,7 +394,7 @@ def written_name(path: str | PathLike[str]) -> Path:
             raise InputError(problem, source=path, cure=cure)
         links += 1
         if links > LINKS_AT_MOST:
-            raise InputError("a link to itself", source=path, cure="name the file itself")
+            return Path(path).absolute()
         link = name.readlink()
         if name.exists() and not (found / link).exists():
             return name  # /proc/self/fd/1 may be a link to a pipe, which has no name

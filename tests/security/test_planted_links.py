@@ -130,10 +130,21 @@ def test_own_links_are_followed(tmp_path: Path) -> None:
     assert (tmp_path / "link.txt").is_symlink()
 
 
-def test_a_link_to_itself_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.txt").symlink_to("x.txt")
-    with pytest.raises(InputError, match="a link to itself"):
-        write_text_atomic(tmp_path / "x.txt", "text")
+def test_a_link_to_itself_is_replaced(tmp_path: Path) -> None:
+    for name in ("x.txt", "folder"):
+        (tmp_path / name).symlink_to(name)
+    write_text_atomic(tmp_path / "x.txt", "text")
+    assert not (tmp_path / "x.txt").is_symlink()
+    with pytest.raises(InputError, match="Too many levels of symbolic links"):
+        write_text_atomic(tmp_path / "folder" / "x.txt", "text")
+
+
+def test_a_service_starts_with_a_state_that_links_to_itself(tmp_path: Path) -> None:
+    state = tmp_path / "cangauge-state.json"
+    state.symlink_to(state)
+    ended = in_process(*RUN, "--config", BRIEF, "--state", state)
+    assert ended.code == 0, ended.err
+    assert "Traceback" not in ended.err
 
 
 @pytest.mark.parametrize("rights", [0o1777, 0o777])
