@@ -271,7 +271,9 @@ def _stale(observed: Observation) -> tuple[float, str]:
     for role, times in observed.good_sent_s.items():
         limit_s = TIMEOUT_S[role] + STALE_SLACK_S
         for estimate in observed.published:
-            if estimate.status != VALID:
+            # A missing temperature leaves the estimate valid, with this reason.
+            is_said = role == "temperature" and estimate.reason & Reason.TEMPERATURE_MISSING
+            if estimate.status != VALID or is_said:
                 continue
             place = bisect_right(times, estimate.time_s)
             age_s = estimate.time_s - (times[place - 1] if place else observed.began_s)
