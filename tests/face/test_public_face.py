@@ -59,7 +59,7 @@ def test_the_examples_of_the_package_run() -> None:
     [
         ("own_log_to_soc", "mean error of the SoC"),
         ("read_a_diagnosis", "late (time_skew"),
-        ("live_bus", "{'soc_pct': "),
+        ("live_bus", "'soc_pct': "),
     ],
 )
 def test_each_notebook_runs(example: str, words: str, project: Path, tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def check_limited(rng: Random, limiter: StampLimiter, frame: can.Message, number
 
 
 def check_readable(rng: Random, reader: SocReader, message: can.Message) -> None:
-    assert reader.read(message) is not None
+    assert reader.read(message)[1]
     data = bytearray(message.data)
     data[rng.randrange(6)] ^= 1 << rng.randrange(8)
     message.data = bytearray(RULES["generic"].protect(data, rng.randrange(16)))
