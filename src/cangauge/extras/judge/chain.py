@@ -13,7 +13,6 @@ capacity does to S and v is that of the effects of the model library.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -22,6 +21,7 @@ import numpy as np
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.extras.judge.gauge import is_limit, read_published, resolution_pct
+from cangauge.logs.charge import DAY_S
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, candidates
@@ -33,8 +33,6 @@ from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis, resistance_fa
 BLOCKS_AT_MOST: Final = 240
 """Most blocks used of a stretch. The voltage error is correlated over 300 s, so denser blocks would
 add little information."""
-LONGEST_S: Final = 86400.0
-"""A longer stretch is cut, and continued [s]: as long as the voltage's error keeps its level."""
 PARTED_S: Final = 600.0
 """Interval without samples that ends a stretch [s]: the car may have been charged or driven."""
 SHORTEST_S: Final = 240.0
@@ -126,6 +124,10 @@ class Chain:
         Number of the piece of a count, in order of time; −1 where there is none.
     is_full : array of shape (blocks,)
         Whether a charge has ended full.
+    fitting_pct : array of shape (blocks,)
+        SoC with the start of each stretch at which the voltage fits best [%].
+    level_v : array of shape (blocks,)
+        Standard deviation of the level of the voltage's error [V].
     """
 
     def __init__(self, logs: Sequence[Log], model: Model) -> None:
@@ -150,25 +152,27 @@ class Chain:
         self.samples = samples = Samples(*map(np.concatenate, zip(*parts, strict=True)))
         piece = np.cumsum(samples.is_cut)
         self.row_piece = np.where(np.isfinite(samples.count_pct), piece, -1)
-        block = np.floor(3600.0 * samples.hours / model.noise.block_s)
+        block_h = model.noise.block_s / 3600.0
+        block = np.floor(samples.hours / block_h)
         parted = np.diff([samples.stretch, block, piece], prepend=-1.0)
         first = np.flatnonzero(parted.any(axis=0))
         every = _means(samples, first)
         used, is_full = _used(every, len(cuts), model)
-        used = np.union1d(used, np.flatnonzero(np.diff(piece[first], prepend=0)))
-        first = first[used]
         of_used: list[Any] = [each[used] for each in every]
-        # A count holds until the next block that is used; a coarse one is seldom known.
-        count_pct = _means(samples, first).count_pct
-        self.blocks = blocks = Samples(*of_used)._replace(count_pct=count_pct)
+        self.blocks = blocks = Samples(*of_used)
         # The delay line fills.
-        blocks.voltage_v[blocks.hours < 3.0 * model.noise.block_s / 3600.0] = np.nan
+        blocks.voltage_v[blocks.hours < 3.0 * block_h] = np.nan
         self.is_full = is_full[used]
-        self.piece = np.where(np.isfinite(count_pct), piece[first], -1)
+        self.piece = np.where(np.isfinite(blocks.count_pct), piece[first[used]], -1)
         self.stretches = [
             Stretch(log, rows, _places(samples.stretch, k), _places(blocks.stretch, k), continues)
             for k, (log, rows, continues) in enumerate(cuts)
         ]
+        self.fitting_pct, noise = self._fitting(), model.noise
+        growth = np.maximum(1.0, resistance_factor(blocks.temperature_c))
+        self._cold = np.asarray(growth**noise.cold_exponent)
+        self._axis_v = noise.soc_std_pct * self.slope(self.fitting_pct)
+        self.level_v = np.hypot(self._cold * noise.level_std_v, self._axis_v)
 
     def sensor(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Return the change of SoC [%] and of voltage [V] by a unit of one of `SENSORS`."""
@@ -192,9 +196,8 @@ class Chain:
         curve = hermite_basis(soc_pct, self.functions.soc_pct) @ self.functions.value
         return np.asarray(curve + self.blocks.load @ self.functions.load)
 
-    @cached_property
-    def fitting_pct(self) -> FloatArray:
-        """SoC with the start of each stretch at which the voltage fits best [%]."""
+    def _fitting(self) -> FloatArray:
+        """Return the SoC with the start of each stretch at which the voltage fits best [%]."""
         starts = np.arange(1.0, 100.0)
         firsts = [each.blocks.start for each in self.stretches]
         squares = []
@@ -203,19 +206,6 @@ class Chain:
             squares.append(np.add.reduceat(np.nan_to_num(error_v) ** 2, firsts))
         best = starts[np.argmin(squares, axis=0)]
         return np.asarray(best[self.blocks.stretch] - self.blocks.drawn_pct)
-
-    @cached_property
-    def _voltage_std(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        noise = self.model.noise
-        growth = np.maximum(1.0, resistance_factor(self.blocks.temperature_c))
-        cold = np.asarray(growth**noise.cold_exponent)
-        axis_v = np.asarray(noise.soc_std_pct * self.slope(self.fitting_pct))
-        return cold, axis_v, np.hypot(cold * noise.level_std_v, axis_v)
-
-    @property
-    def level_v(self) -> FloatArray:
-        """Standard deviation of the level of the voltage's error at each block [V]."""
-        return self._voltage_std[2]
 
     def voltages(self, varies: float) -> list[tuple[IntArray, FloatArray]]:
         """Return the blocks of each stretch with a voltage, and a root of the errors' covariance.
@@ -226,7 +216,7 @@ class Chain:
         for stretch in self.stretches:
             at = np.arange(stretch.blocks.start, stretch.blocks.stop)
             at = at[np.isfinite(self.blocks.voltage_v[at])]
-            cold, axis_v, level_v = (std[at] for std in self._voltage_std)
+            cold, axis_v, level_v = self._cold[at], self._axis_v[at], self.level_v[at]
             apart_s = 3600.0 * np.abs(self.blocks.hours[at, None] - self.blocks.hours[at])
             slow = np.outer(cold, cold) * noise.slow_std_v**2 * np.exp(-apart_s / noise.slow_time_s)
             lasting = np.outer(level_v, level_v)
@@ -255,14 +245,17 @@ def _places(stretch: IntArray, k: int) -> slice:
 
 
 def _uninterrupted(log: Log) -> Iterator[tuple[slice, bool]]:
-    """Yield the rows of a log between its pauses, and whether they continue those before."""
+    """Yield the rows of a log between its pauses, and whether they continue those before.
+
+    Within a day the error of the voltage keeps its level.
+    """
     step_s = np.diff(log.time_s)
     pauses = np.flatnonzero(step_s > max(PARTED_S, 10.0 * float(np.median(step_s)))) + 1
     for first, last in pairwise([0, *pauses, len(log)]):
         duration_s = float(log.time_s[last - 1] - log.time_s[first])
         if last - first < 5 or duration_s < SHORTEST_S:
             continue
-        parts = max(1, int(np.ceil(duration_s / LONGEST_S - 0.01)))
+        parts = max(1, int(np.ceil(duration_s / DAY_S - 0.01)))
         ends = log.time_s[first] + duration_s * np.arange(1, parts) / parts
         edges = [first, *np.searchsorted(log.time_s, ends).tolist(), last]
         for number, (low, high) in enumerate(pairwise(edges)):

@@ -118,9 +118,9 @@ class Linearised:
             total += Rows.correlated(X, error_v[at], root)
         full = np.flatnonzero(chain.is_full)
         total += Rows.of(self._S[full].toarray(), 100.0 - counted_pct[full], FULL_STD_PCT)
-        later = [k for k, each in enumerate(chain.stretches) if each.continues]
-        first = np.array([chain.stretches[k].blocks.start for k in later], dtype=np.intp)
-        ends = np.array([chain.stretches[k].samples.start - 1 for k in later], dtype=np.intp)
+        later = [each for each in chain.stretches if each.continues]
+        first = np.array([each.blocks.start for each in later], dtype=np.intp)
+        ends = np.array([each.samples.start - 1 for each in later], dtype=np.intp)
         drawn_pct = chain.blocks.drawn_pct
         between_pct = drawn_pct[first] + chain.samples.drawn_pct[ends] - drawn_pct[first - 1]
         apart_pct = counted_pct[first - 1] - counted_pct[first] - between_pct

@@ -21,6 +21,8 @@ FREE_PCT: Final = 60.0
 """Standard deviation of the SoC at the start of a stretch [%]: unknown."""
 PIECE_PCT: Final = 0.5
 """Standard deviation of the level of a piece that is right [%]."""
+LAST: Final = 8
+"""Logs of which each may be the first with a fault of a sensor: twelve columns for each."""
 P_FAULT: Final = 0.05
 """Prior probability of most faults."""
 
@@ -235,14 +237,17 @@ def _pieces(chain: Chain) -> list[int]:
 
 
 def _onsets(chain: Chain) -> list[int]:
-    """Return the stretches with which a fault of a sensor may begin.
+    """Return the stretches with which a fault of a sensor may begin: of the last eight, each.
 
-    After a pause it may be each. Within an unbroken record nothing marks the moment, so that it is
-    found to a factor of two: the last stretch, the last two, four, eight, ….
+    Further back, and within an unbroken record, where nothing marks the moment, it is found to a
+    factor of two: the last two stretches, the last four, eight, sixteen, ….
     """
-    number = len(chain.stretches)
-    back = {2**k for k in range(number.bit_length())}
-    return [k for k, each in enumerate(chain.stretches) if not each.continues or number - k in back]
+    found, number = [0], len(chain.stretches)
+    for k, each in enumerate(chain.stretches[1:], start=1):
+        back = number - k
+        if back & (back - 1) == 0 or (back < LAST and not each.continues):
+            found.append(k)
+    return found
 
 
 def _level(shown: BoolArray, piece: int, since: int) -> Column:

@@ -14,9 +14,8 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.logs.log import Log
+from cangauge.model.prior import BLOCK_S
 
-COARSE_PCT: Final = 0.2
-"""Resolution from which y is used only at the rows that `_counts` selects [%]."""
 LIMIT_PCT: Final = 0.05
 """A published SoC as close to 0 or 100 % is a limit [%]."""
 JUMP_PCT: Final = 1.0
@@ -26,8 +25,6 @@ SEVERAL: Final = 4
 that jumps more often in a stretch does not count: its jumps are noise."""
 STAND_PCT: Final = 2.0
 """A published SoC stands still where charge moves by this and two of its steps [%]."""
-WINDOW_S: Final = 30.0
-"""Windows whose medians are searched for jumps [s]."""
 
 
 def published_pct(log: Log) -> FloatArray:
@@ -74,13 +71,13 @@ def read_published(
     shown, steps = published_pct(log), np.full(len(log), step_pct)
     held, is_cut = _held(shown, drawn_pct), np.zeros(len(log), dtype=bool)
     is_blank = stands(held, steps) | is_limit(shown)
-    count = _counts(np.where(is_blank, np.nan, shown), drawn_pct, step_pct) + drawn_pct
+    count = np.where(is_blank, np.nan, shown) + drawn_pct
     least = max(JUMP_PCT, 2.0 * step_pct)
     is_cut[_jumps(log.time_s, count, shown, least)] = True
     # A count that goes on after a stand or a limit as it would have without is the same piece.
-    for before, after in pairwise(np.flatnonzero(np.isfinite(count))):
-        if is_blank[before + 1 : after].any():
-            is_cut[after] |= abs(count[after] - count[before]) >= least
+    known, blanks = np.flatnonzero(np.isfinite(count)), np.cumsum(is_blank)
+    is_after_blank = np.diff(blanks[known]) > 0
+    is_cut[known[1:]] |= is_after_blank & (np.abs(np.diff(count[known])) >= least)
     return shown, count, is_cut, held, steps
 
 
@@ -99,34 +96,13 @@ def _held(shown: FloatArray, drawn: FloatArray) -> FloatArray:
     return held
 
 
-def _counts(shown: FloatArray, drawn: FloatArray, step_pct: float) -> FloatArray:
-    """Return y at the rows where it is known better than by its resolution, NaN elsewhere [%].
-
-    A coarse SoC that changes by one step is half-way between two. It is known to half a step where
-    it changes by more, at its first and last row, and whenever charge of two further steps has
-    flowed without a change.
-    """
-    known = np.flatnonzero(np.isfinite(shown))
-    if step_pct < COARSE_PCT or not known.size:
-        return shown
-    value, charge = shown[known], drawn[known]
-    change = np.diff(value, prepend=value[0])
-    held = np.cumsum(change != 0.0)  # number of the value that is held
-    since = np.flatnonzero(np.diff(held, prepend=-1))[held]
-    steps = np.floor(np.abs(charge - charge[since]) / (2.0 * step_pct))
-    most = np.maximum.accumulate(held * (1.0 + steps.max()) + steps)
-    is_used = np.diff(most, prepend=-1.0) > 0.0
-    is_used[-1] = True
-    is_crossing = np.round(np.abs(change) / step_pct) == 1.0
-    used = np.full_like(shown, np.nan)
-    used[known[is_used]] = (value - np.where(is_crossing, 0.5 * change, 0.0))[is_used]
-    return used
-
-
 def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, least: float) -> list[int]:
-    """Return the rows at which the count has jumped; the rows within a jump become NaN."""
+    """Return the rows at which the count has jumped; the rows within a jump become NaN.
+
+    Medians of windows are compared.
+    """
     known = np.flatnonzero(np.isfinite(count))
-    window = np.floor((time_s[known] - time_s[known[:1]]) / WINDOW_S)
+    window = np.floor((time_s[known] - time_s[known[:1]]) / BLOCK_S)
     first = np.flatnonzero(np.diff(window, prepend=-1.0))
     if first.size < 3:
         return []

@@ -41,7 +41,6 @@ from cangauge.types import Sample
 
 PACKS: Final = (211, 212, 213, 214)
 """Seeds of the simulated packs; no table of the estimator or the diagnosis has them."""
-DRIVES_A_PACK: Final = 3
 ANSWER_EVERY_S: Final = 20.0
 """Log time between two readings of the gauge [s]: as often it is compared with the truth."""
 QUIET_S: Final = 0.02
@@ -49,8 +48,6 @@ QUIET_S: Final = 0.02
 ANSWER_WITHIN_S: Final = 10.0
 """Longest wait for an answer that a gauge owes [s]: a busy machine changes no score."""
 READY_WITHIN_S: Final = 30.0
-TYPICAL_AH: Final = 60.0
-"""Capacity for which currents of the faults are stated [Ah]; other packs: in proportion."""
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -59,14 +56,15 @@ Drive = tuple[Log, Model]
 
 
 class CountFault(NamedTuple):
-    """What is wrong with the count that a gauge can make."""
+    """What is wrong with the count that a gauge can make; currents over the capacity [1/h]."""
 
     name: str
-    offset_a: float = 0.0
-    """Added to the current, at 60 Ah [A]."""
-    step_a: float = 0.0
-    """Resolution of the current, and below which it reads zero, at 60 Ah [A]."""
-    dead_a: float = 0.0
+    offset_c: float = 0.0
+    """Added to the current."""
+    step_c: float = 0.0
+    """Resolution of the current, below what it reads zero, and the largest that it reads."""
+    dead_c: float = 0.0
+    limit_c: float = math.inf
     gain: float = 1.0
     start_pct: float = 0.0
     """Error of the stated start [% SoC]."""
@@ -76,18 +74,15 @@ class CountFault(NamedTuple):
     """Without frames, from a quarter of the drive on [s]."""
     late_rows: int = 0
     """Rows by which the current is late."""
-    limit_c: float = math.inf
-    """Largest current that is read, over the capacity [1/h]."""
 
     def current_a(self, log: Log, capacity_ah: float) -> FloatArray:
         """Return the current that the gauge reads [A]."""
-        size, limit_a = capacity_ah / TYPICAL_AH, self.limit_c * capacity_ah
         late = np.maximum(np.arange(len(log)) - self.late_rows, 0)
-        current = self.gain * log.current_a[late] + size * self.offset_a
-        if self.step_a:
-            current = size * self.step_a * np.round(current / (size * self.step_a))
-        current = np.where(np.abs(current) < size * self.dead_a, 0.0, current)
-        return np.asarray(np.clip(current, -limit_a, limit_a))
+        rate_c = self.gain * log.current_a[late] / capacity_ah + self.offset_c
+        if self.step_c:
+            rate_c = self.step_c * np.round(rate_c / self.step_c)
+        rate_c = np.where(np.abs(rate_c) < self.dead_c, 0.0, rate_c)
+        return np.asarray(capacity_ah * np.clip(rate_c, -self.limit_c, self.limit_c))
 
     def sent(self, log: Log) -> BoolArray:
         """Return whether the frames of each row are sent; the first ones always are."""
@@ -100,17 +95,17 @@ class CountFault(NamedTuple):
 
 FAULTS: Final = (
     CountFault("none"),
-    *(CountFault(f"offset {a:+g} A", offset_a=a) for a in (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)),
+    *(CountFault(f"offset {a:+g} A", offset_c=a / 60.0) for a in (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)),
     *(CountFault(f"gain {100 * (g - 1):+.0f} %", gain=g) for g in (0.95, 0.99, 1.01, 1.05)),
     *(CountFault(f"start {p:+g} %", start_pct=p) for p in (-20.0, -5.0, 5.0, 20.0)),
     CountFault("1 % of the frames lost", lost=0.01),
     CountFault("10 % of the frames lost", lost=0.1),
     CountFault("a minute without frames", gap_s=60.0),
     CountFault("ten minutes without frames", gap_s=600.0),
-    CountFault("current in steps of 2 A, late by 2 s", step_a=2.0, late_rows=2),
-    CountFault("zero below 2 A, limited to 1 C", dead_a=2.0, limit_c=1.0),
+    CountFault("current in steps of 2 A, late by 2 s", step_c=2.0 / 60.0, late_rows=2),
+    CountFault("zero below 2 A, limited to 1 C", dead_c=2.0 / 60.0, limit_c=1.0),
 )
-"""No fault, and twenty."""
+"""No fault, and twenty; names state the current of a pack of 60 Ah."""
 
 
 def simulated_drives() -> list[Drive]:
@@ -118,10 +113,9 @@ def simulated_drives() -> list[Drive]:
     found = []
     for seed in PACKS:
         runs = [simulate(seed=seed, discharge=True)]
-        runs += [simulate(seed=seed, drive=2 + k, hours=0.5) for k in range(2 * DRIVES_A_PACK)]
+        runs += [simulate(seed=seed, drive=drive, hours=0.5) for drive in range(2, 8)]
         logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
-        model = fit(logs[:-DRIVES_A_PACK], capacity_ah=runs[0].pack.capacity_ah).model
-        found += _every_second(logs[-DRIVES_A_PACK:], model)
+        found += _every_second(logs[4:], fit(logs[:4], capacity_ah=runs[0].pack.capacity_ah).model)
     return found
 
 
