@@ -21,7 +21,6 @@ import numpy as np
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.extras.judge.gauge import is_limit, read_published, resolution_pct
-from cangauge.logs.charge import DAY_S
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, candidates
@@ -33,6 +32,8 @@ from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis, resistance_fa
 BLOCKS_AT_MOST: Final = 240
 """Most blocks used of a stretch. The voltage error is correlated over 300 s, so denser blocks would
 add little information."""
+LONGEST_S: Final = 86400.0
+"""A longer stretch is cut, and continued [s]: as long as the voltage's error keeps its level."""
 PARTED_S: Final = 600.0
 """Interval without samples that ends a stretch [s]: the car may have been charged or driven."""
 SHORTEST_S: Final = 240.0
@@ -245,17 +246,14 @@ def _places(stretch: IntArray, k: int) -> slice:
 
 
 def _uninterrupted(log: Log) -> Iterator[tuple[slice, bool]]:
-    """Yield the rows of a log between its pauses, and whether they continue those before.
-
-    Within a day the error of the voltage keeps its level.
-    """
+    """Yield the rows of a log between its pauses, and whether they continue those before."""
     step_s = np.diff(log.time_s)
     pauses = np.flatnonzero(step_s > max(PARTED_S, 10.0 * float(np.median(step_s)))) + 1
     for first, last in pairwise([0, *pauses, len(log)]):
         duration_s = float(log.time_s[last - 1] - log.time_s[first])
         if last - first < 5 or duration_s < SHORTEST_S:
             continue
-        parts = max(1, int(np.ceil(duration_s / DAY_S - 0.01)))
+        parts = max(1, int(np.ceil(duration_s / LONGEST_S - 0.01)))
         ends = log.time_s[first] + duration_s * np.arange(1, parts) / parts
         edges = [first, *np.searchsorted(log.time_s, ends).tolist(), last]
         for number, (low, high) in enumerate(pairwise(edges)):

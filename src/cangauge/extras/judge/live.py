@@ -24,9 +24,8 @@ from cangauge._extras import require_extra
 from cangauge._files import write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.judge.chain import PARTED_S, SHORTEST_S
+from cangauge.extras.judge.chain import LONGEST_S, PARTED_S, SHORTEST_S
 from cangauge.logs.canonical import write_log
-from cangauge.logs.charge import DAY_S
 from cangauge.logs.log import Log
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
@@ -113,7 +112,7 @@ class LiveJudge(Output):
         if self._rows:
             since_s = sample.time_s - self._rows[-1][0]
             whole_s = sample.time_s - self._rows[0][0]
-            if not 0.0 <= since_s <= PARTED_S or whole_s > DAY_S:
+            if not 0.0 <= since_s <= PARTED_S or whole_s > LONGEST_S:
                 self._end_stretch()
             elif since_s < 1.0:
                 return
