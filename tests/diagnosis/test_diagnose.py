@@ -250,16 +250,24 @@ def test_a_wrong_start_belongs_to_the_log(known: Healthy, model: Model) -> None:
     assert stated.extended_model == model
 
 
-def test_a_correction_that_makes_the_soc_worse_is_refused(
-    known: Healthy, model: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        Diagnosis, "_soc_error_pct", lambda self, of: 1.0 if of is self.model else 1.3
+def test_a_correction_that_makes_the_soc_worse_is_refused(known: Healthy, model: Model) -> None:
+    """The car's SoC lies where the voltage has it, except in the first row."""
+
+    def own_soc(log: Log) -> Log:
+        assert log.soc_pct is not None
+        soc = log.soc_pct + 10.0
+        soc[0] = log.soc_pct[0]
+        return replace(log, soc_pct=soc)
+
+    logs = [more_volts(day(seed), 5.0) for seed in (20, 21)]
+    kept, refused = (
+        judged(diagnose(each, model, known), voltage_offset=1.0)
+        for each in (logs, [own_soc(log) for log in logs])
     )
-    found = diagnose([more_volts(day(seed), 5.0) for seed in (20, 21)], model, known)
-    assert not found.is_written
-    assert found.why_not is not None
-    assert found.why_not in found.summary
+    assert kept.is_written
+    assert not refused.is_written
+    assert refused.why_not == "the SoC error of these logs would grow with it"
+    assert refused.why_not in refused.summary
 
 
 @pytest.mark.parametrize(
