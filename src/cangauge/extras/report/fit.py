@@ -43,11 +43,7 @@ def fit_page(result: Identification) -> Page:
     """Return the page of an identification."""
     logs, model, fits = result.logs, result.model, result.fits
     time = _time(result)
-    slope = slope_figure(
-        result.voltage_model,
-        "A voltage error divided by this slope is the SoC error: where the slope is small, the"
-        " voltage hardly determines the SoC.",
-    )
+    slope = _slope_figure(result.voltage_model)
     rows = sum(len(item.rows) for item in fits)
     return Page(
         title=f"Voltage model {model.name}",
@@ -60,7 +56,7 @@ def fit_page(result: Identification) -> Page:
             "Voltage error": [*_error_figures(result, time), _error_table(result)],
             "State of charge from voltage": [_newton_figure(result, time)],
             "Resistance and energy": [_resistance_figure(result), _energy(result)],
-            "Coefficients": coefficient_tables(model, result.published.condition_number),
+            "Coefficients": _coefficients(model, result.published.condition_number),
             "Effects": _effects(result),
             "Recorded data": _recorded_figures(result, time),
             "How the model was made": _method(result),
@@ -125,48 +121,35 @@ def _voltage_figure(result: Identification, time: TimeFigures) -> Figure:
 
 
 def _ocv_figure(result: Identification) -> Figure:
+    """Return the pseudo-OCV over SoC, with dots where the logs have it."""
     model = result.voltage_model
     effects = ", effects" if result.model.effects else ""
-    caption = (
-        f"Dots: the measured voltage minus the model's resistances{effects} and temperature term."
-        f" The logs cover {span(*model.range.soc_pct, 1, '%')}; in the shaded part the curve"
-        f" {result.beyond}."
-    )
-    soc = np.concatenate([item.rows.soc_pct for item in result.fits])
-    residual = np.concatenate([item.residual_v for item in result.fits])
-    return curve_figure(model, caption, (soc, residual + model.pseudo_ocv(soc)))
-
-
-def curve_figure(
-    model: VoltageModel, caption: str, measured: tuple[FloatArray, FloatArray] | None = None
-) -> Figure:
-    """Return the pseudo-OCV over SoC, with dots at measured SoC [%] and voltage [V]."""
     figure = Figure(
         "Pseudo-OCV against SoC",
         "state of charge [%]",
         "voltage [V]",
-        caption,
+        f"Dots: the measured voltage minus the model's resistances{effects} and temperature term."
+        f" The logs cover {span(*model.range.soc_pct, 1, '%')}; in the shaded part the curve"
+        f" {result.beyond}.",
         hover="$name: @y{0.00} V<br>at @x{0.0} %",
         height=340,
     )
-    low, high = 0.0, 100.0
-    if measured is not None:
-        soc, voltage_v = measured
-        figure.cloud("measured, less drop", soc, voltage_v, GREY)
-        low, high = min(low, soc.min()), max(high, soc.max())
-    grid = np.linspace(low, high, 401)
+    soc = np.concatenate([item.rows.soc_pct for item in result.fits])
+    residual = np.concatenate([item.residual_v for item in result.fits])
+    figure.cloud("measured, less drop", soc, residual + model.pseudo_ocv(soc), GREY)
+    grid = np.linspace(min(0.0, soc.min()), max(100.0, soc.max()), 401)
     figure.line("pseudo-OCV", grid, model.pseudo_ocv(grid), BLUE, line_width=2.2)
     figure.shade_outside(*model.range.soc_pct)
     return figure
 
 
-def slope_figure(model: VoltageModel, caption: str) -> Figure:
-    """Return the slope of the pseudo-OCV over SoC."""
+def _slope_figure(model: VoltageModel) -> Figure:
     figure = Figure(
         "Slope of the pseudo-OCV",
         "state of charge [%]",
         "dU/dS [V per %]",
-        caption,
+        "A voltage error divided by this slope is the SoC error: where the slope is small, the"
+        " voltage hardly determines the SoC.",
         hover="@y{0.000} V per %<br>at @x{0.0} %",
         height=340,
     )
@@ -327,7 +310,7 @@ def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
 # --- Tables
 
 
-def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
+def _coefficients(model: Model, condition_number: float) -> list[Block]:
     """Return the coefficients of a model: loads, and the published equation where identified."""
     blocks: list[Block] = []
     if model.loads is not None:
@@ -433,7 +416,7 @@ def _effects(result: Identification) -> list[Block]:
     return [Table.of(parameters, note) if parameters else note, *([searched] if steps else [])]
 
 
-def settings_table(model: Model) -> Table:
+def _settings(model: Model) -> Table:
     """Return how a model was made, and the range that it is known in."""
     cells = "" if model.cells is None else f", {model.cells} cells in series"
     rows = [
@@ -454,7 +437,7 @@ def _method(result: Identification) -> list[Block]:
         for remark in log.remarks:
             by_text.setdefault(remark, []).append(log.name)
     remarks = [*result.remarks, *(f"{', '.join(names)}: {text}" for text, names in by_text.items())]
-    blocks: list[Block] = [settings_table(result.model), _logs(result)]
+    blocks: list[Block] = [_settings(result.model), _logs(result)]
     return [*blocks, "Remarks:", remarks] if remarks else blocks
 
 
