@@ -403,6 +403,12 @@ def written_name(path: str | PathLike[str]) -> Path:
     return found
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, but none through a link of another user (InputError)."""
+    written_name(path / "file")
+    path.mkdir(parents=True, exist_ok=True)
+
+
 def is_own(info: os.stat_result) -> bool:
     """Return whether a file belongs to this user or to root; always true on Windows."""
     return not hasattr(os, "geteuid") or info.st_uid in {0, os.geteuid()}

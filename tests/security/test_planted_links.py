@@ -111,6 +111,14 @@ def test_a_planted_folder_is_refused(shared: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_no_folder_is_made_through_a_planted_link(shared: Path, tmp_path: Path) -> None:
+    planted(shared / "out", tmp_path)
+    ended = in_process("export-c", "-m", leaf_model_path(), "-o", shared / "out" / "deep")
+    assert ended.code == 2
+    assert "out is a link of another user" in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_own_link_that_leads_to_a_planted_one_stops_there(shared: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.write_text("mine")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cangauge._extras import extra, require_extra
-from cangauge._files import write_text_atomic
+from cangauge._files import make_folder, write_text_atomic
 from cangauge._resources import shared_file
 from cangauge._text import number, significant
 from cangauge.cli.options import JSON, option
@@ -71,7 +71,7 @@ def demo_command(
     require_extra("report")
     began = time.monotonic()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     except OSError as error:
         problem, cure = f"cannot create this folder: {error.strerror}", "name another one"
         raise InputError(problem, source=folder, field="--folder", cure=cure) from error

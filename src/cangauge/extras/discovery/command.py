@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from cangauge._files import check_writable, write_texts_atomic
+from cangauge._files import check_writable, make_folder, write_texts_atomic
 from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import CangaugeError, InputError
@@ -115,7 +115,7 @@ def init_command(
             raise _undecided(proposal, unclear, nominal_voltage, output, quiet=json_output)
         _prove(proposal, paths, output, bus, folder)
         texts = proposal.texts(output, bus)
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
     show = partial(_show, proposal, files, output)

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._files import text_sha256, write_texts_atomic
+from cangauge._files import make_folder, text_sha256, write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.bus.publish import SocPublisher
@@ -127,7 +127,7 @@ def export_c(
     _refuse_foreign_names(folder, texts)
     try:
         for parent in {(folder / name).parent for name in texts}:
-            parent.mkdir(parents=True, exist_ok=True)
+            make_folder(parent)
     except OSError as error:
         problem = f"this folder cannot be made: {error.strerror}"
         raise InputError(problem, field="--output", value=str(folder)) from error

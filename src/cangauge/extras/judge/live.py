@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from cangauge._extras import require_extra
-from cangauge._files import write_text_atomic
+from cangauge._files import make_folder, write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import InputError
 from cangauge.extras.judge.chain import LONGEST_S, PARTED_S, SHORTEST_S
@@ -188,7 +188,7 @@ def output_of(config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJu
     def make_output(service: Service) -> LiveJudge:
         folder = Path(asked.folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
         except OSError as error:
             raise InputError(f"cannot be made: {error.strerror}", field="judge.folder") from error
 
