@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
 from cangauge.diagnosis.evidence import learn
-from cangauge.diagnosis.posterior import ALARM, Posterior, features, shipped_weights
+from cangauge.diagnosis.posterior import ALARM, ALIKE, Posterior, features, shipped_weights
 from cangauge.diagnosis.rows import trace
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
@@ -136,6 +136,8 @@ def tables(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> li
     whole.add_row("healthy: gap", f"{healthy.count('gap')} of {len(healthy)}")
     whole.add_row("healthy: likely", f"{healthy.count('likely')} of {len(healthy)}")
     whole.add_row("P(fault) → frequency (cases)", _calibration(rows))
+    alike = [x.truth["fault"] in ALIKE[p.alike] for x, p in rows if p.alike is not None]
+    whole.add_row("what is off, beside two faults: right", f"{sum(alike)} of {len(alike)}")
     for measure, value in _corrections(rows):
         whole.add_row(measure, value)
     return [by_group, whole]
