@@ -327,7 +327,8 @@ def left_out(
     scale : float
         κ²: mean squares of their errors over those stated, 1 at least.
     strain : float
-        Mean of `Solution.strain_of` over its mean under the model, 1 at most.
+        Mean of `Solution.strain_of` over its mean under the model, 1 at most. The prior's logs have
+        1, so that it is two fifths or more.
     """
     squares, strains = [], []
     for item, other in zip(sums, without, strict=False):
@@ -339,9 +340,12 @@ def left_out(
         fast2 *= SECONDS_PER_DATUM / item.weight
         squares.append(error**2 / (variance + level_v**2 + fast2))
         strains.append(other.strain_of(item, level_v) / (chemistry.functions + 1))
-    number = LEFT_OUT_PRIOR + len(squares)
-    scale = max(1.0, (LEFT_OUT_PRIOR + float(np.sum(squares))) / number)
-    return scale, min(1.0, (LEFT_OUT_PRIOR + float(np.sum(strains)) / scale) / number)
+    scale = (LEFT_OUT_PRIOR + float(np.sum(squares))) / (LEFT_OUT_PRIOR + len(squares))
+    scale = max(1.0, scale)
+    # A mean of many logs is no bound of the next one, so that they weigh no more than a few.
+    weight = min(len(strains), LOGS_AT_LEAST) / max(len(strains), 1)
+    strain = LEFT_OUT_PRIOR + weight * float(np.sum(strains)) / scale
+    return scale, min(1.0, strain / (LEFT_OUT_PRIOR + weight * len(strains)))
 
 
 def solve_scaled(
