@@ -9,7 +9,7 @@ import select
 import signal
 import socket
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -306,20 +306,24 @@ def test_connections_are_limited(both: Served) -> None:
 
 
 def test_guesses_of_the_token_are_slowed_down(both: Served) -> None:
-    def answer(path: str, body: bytes, header: str = "") -> int:
-        head = f"{path} HTTP/1.1\r\nHost: x\r\n{header}Content-Length: {len(body)}\r\n\r\n"
-        with connected(page_port(both), head.encode() + body) as client:
-            return int(client.recv(12).split()[1])
+    def answers(requests: list[str]) -> list[int]:
+        both.process.send_signal(signal.SIGSTOP)  # so that all come at once, on a busy machine too
+        clients = [connected(page_port(both), request.encode()) for request in requests]
+        both.process.send_signal(signal.SIGCONT)
+        with ExitStack() as stack:
+            return [int(stack.enter_context(each).recv(12).split()[1]) for each in clients]
 
-    def entered(token: str) -> int:
-        form = "Content-Type: application/x-www-form-urlencoded\r\n"
-        return answer("POST /enter", f"token={token}".encode(), form)
+    def entered(token: str) -> str:
+        form = (
+            f"Content-Type: application/x-www-form-urlencoded\r\nContent-Length: {6 + len(token)}"
+        )
+        return f"POST /enter HTTP/1.1\r\nHost: x\r\n{form}\r\n\r\ntoken={token}"
 
-    assert [entered("guess") for _ in range(20)][-1] == 429
-    assert entered(TOKEN) == 429  # or a guess that is right would show
-    bearer = [answer("GET /rows", b"", "Authorization: Bearer guess\r\n") for _ in range(60)]
-    assert bearer[0] == 401
-    assert bearer[-1] == 429
+    # The right one too, or a guess that is right would show.
+    assert answers([*[entered("guess")] * 20, entered(TOKEN)])[-1] == 429
+    bearer = "GET /rows HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer guess\r\n\r\n"
+    codes = answers([bearer] * 60)
+    assert (codes[0], codes[-1]) == (401, 429)
 
 
 @pytest.mark.parametrize("origin", ["http://[", "http://[::1", "http://a]b"])
