@@ -261,9 +261,10 @@ class BusConnection:
         self.is_off = "bus_off" in kinds or (self.is_off and "restarted" not in kinds)
 
     def _classify(self, error: Exception) -> None:
-        """Count an error of a single packet; take any other as a lost bus.
+        """Count a packet that is no frame as garbled; take any other error as a lost bus.
 
-        The driver could not unpack a packet where a `CanOperationError` has a cause in Python code.
+        A driver that cannot unpack a packet raises a `CanOperationError`. Its cause is then an
+        error of Python code, neither an OSError nor a CanError.
         """
         cause = error.__cause__
         is_packet = isinstance(error, can.CanOperationError) and cause is not None

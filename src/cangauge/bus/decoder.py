@@ -239,9 +239,9 @@ class SampleDecoder:
     ----------
     vehicle : Vehicle
     pack : PackProperties, optional
-        Pack properties from the model. Without them only stated limits apply, and those of a SoC,
-        and no signal counts as stuck: a capture with a wrong scale then shows as such, not as a
-        missing signal.
+        Pack properties from the model: they limit the signals' values, and detect stuck signals.
+        None: only the limits of the map file and those of a SoC apply, and no signal counts as
+        stuck. A capture with a wrong scale then shows its wrong values instead of missing ones.
     statistics : FrameStatistics, optional
         Counts to continue.
 
@@ -267,8 +267,8 @@ class SampleDecoder:
         self.now_s = self._suspected_s = -math.inf  # the last sign of a second sender
         self._pairing = Pairing(vehicle.pair_within_s)
         current, voltage = vehicle.current, vehicle.voltage
-        has_same_turn = current.codec.conditions == voltage.codec.conditions
-        self._is_one_frame = current.key == voltage.key and has_same_turn
+        has_same_conditions = current.codec.conditions == voltage.codec.conditions
+        self._is_one_frame = current.key == voltage.key and has_same_conditions
         fixed_c = vehicle.fixed_temperature_c
         self._fixed_c = math.nan if fixed_c is None else fixed_c
         self._routes: dict[int, _Route] = {}

@@ -270,7 +270,10 @@ class SocReader:
 
 
 def reason_bits(reasons: Reason) -> Reason:
-    """Return the 20 bits of the frame: a wrong sign of current is an implausible input there."""
+    """Return the reasons in the frame's 20 bits.
+
+    The frame has no bit for SIGN_SUSPECT, which is sent as IMPLAUSIBLE_INPUT.
+    """
     bits = int(reasons)
     if bits & Reason.SIGN_SUSPECT:
         bits = bits & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT

@@ -37,8 +37,8 @@ _LOG = logging.getLogger(__name__)
 _warn = partial(emit, _LOG, logging.WARNING)
 
 LATE_S: Final = 0.01
-"""Longest delay of periodic frames for a sample that is due, and shortest interval of housekeeping
-under continuous traffic [s]."""
+"""Longest time that due frames wait for a sample to arrive [s]. Also the shortest interval of
+housekeeping under continuous traffic."""
 LOGGED_FROM_S: Final = 1.0
 """Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
 NEVER_SEEN_S: Final = 60.0
@@ -97,12 +97,17 @@ class Loop:
         self._configure()
         self._began_s = self._now_s = self._publish_s = self._keep_s = time.monotonic()
         self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, config.state_every_s)
-        # Times at which the latest sample was processed and received. They differ while frames wait
-        # in the socket, after the process was suspended or under load.
+        # Time at which the latest sample was processed, and time at which the frames with the
+        # latest sample that the estimator took arrived. Frames may wait in the socket between the
+        # two: under load, or while the process is suspended.
         self._sample_s = self._came_s = self._began_s
 
     def _configure(self) -> None:
-        """Poll and receive for the pipeline's present vehicle, and what shows other senders."""
+        """Set up polling and the receive filters for the pipeline's present vehicle.
+
+        The filters also pass the ids that show other senders: published frames, requests and
+        REPLAY_CLOCK.
+        """
         pipeline, poll = self._pipeline, self._config.poll
         targets, ids = pipeline.vehicle.poll_targets, pipeline.settings.ids
         asked_s = {} if self._poller is None else self._poller.asked_s
@@ -138,9 +143,9 @@ class Loop:
 
     def _is_over(self) -> bool:
         duration_s, idle_s = self._config.duration_s, self._config.until_idle_s
-        is_late = duration_s is not None and self._now_s - self._began_s >= duration_s
+        is_complete = duration_s is not None and self._now_s - self._began_s >= duration_s
         is_idle = idle_s is not None and self._now_s - self._sample_s >= idle_s
-        return is_late or (is_idle and self._pipeline.samples > 0)
+        return is_complete or (is_idle and self._pipeline.samples > 0)
 
     def _iterate(self) -> None:
         """Receive once, process the frames, and do what is due."""
@@ -166,14 +171,14 @@ class Loop:
 
     # --- frames → estimates
 
-    def _process(self, messages: list[can.Message], now_s: float) -> None:
-        """Estimate from frames received at a steady time [s]."""
+    def _process(self, messages: list[can.Message], received_s: float) -> None:
+        """Estimate from frames that were received together at a time by `steady_s` [s]."""
         pipeline, poller = self._pipeline, self._poller
         samples_before, taken_before, stamp_s = pipeline.samples, pipeline.taken, math.nan
         stamps = [message.timestamp for message in messages]
-        lag_s = now_s - self._stamps.limit(messages, self._drained_s, now_s)
-        for message, received_s in zip(messages, stamps, strict=True):
-            if message.arbitration_id in self._not_input and self._is_not_input(message):
+        lag_s = received_s - self._stamps.limit(messages, self._drained_s, received_s)
+        for message, original_s in zip(messages, stamps, strict=True):
+            if message.arbitration_id in self._not_input and self._handle_not_input(message):
                 continue
             for output in self._frame_outputs:
                 self._give(output, "on_frame", message)
@@ -181,7 +186,7 @@ class Loop:
                 self._ask(poller.take(message, self._now_s))
             if not pipeline.handle(message):
                 continue
-            stamp_s = received_s
+            stamp_s = original_s
             if self._sample_outputs or pipeline.is_replay:
                 estimate = pipeline.latest
                 self._give_sample(estimate)
@@ -195,8 +200,8 @@ class Loop:
             self._came_s = began_s - lag_s if self._stamps_are_arrival else began_s
             self._monitor.stepped(stamp_s, (self._now_s - began_s) / taken, self._came_s)
 
-    def _is_not_input(self, message: can.Message) -> bool:
-        """Handle a frame with an id that is not the vehicle's; return False if it is input."""
+    def _handle_not_input(self, message: can.Message) -> bool:
+        """Note what a frame shows of other senders; return False for a frame of the vehicle."""
         frame_id, ids = message.arbitration_id, self._pipeline.settings.ids
         if message.is_extended_id:
             return False

@@ -36,11 +36,21 @@ NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE
 class FrameCounts:
     """Frames and values by outcome, over all logs of a run.
 
-    Frames are lost by their alive counters and by the counts of a replay's clock. Wanted frames
-    have a wrong CRC, repeat a counter or are too short. Values are coded as not available,
-    implausible (out of range, or changed too fast), of a stuck signal, or held back until their
-    signal has recovered. Untimed frames came before the first REPLAY_CLOCK, where that is the time
-    source; each new log is a beginning. Receive stamps step back where a clock was set.
+    Parameters
+    ----------
+    frames, samples : int
+        Frames received, wanted or not; samples decoded from them.
+    lost : int
+        Frames that are missing by the alive counters and by the counts of a replay's clock.
+    crc_errors, repeated, short : int
+        Refused frames: with a wrong CRC, with a repeated alive counter, with too few bytes.
+    not_available, implausible, stuck, held_back : int
+        Refused values: coded as not available; out of range or changed too fast; of a stuck signal;
+        plausible, but of a signal that has not recovered yet.
+    untimed : int
+        Frames before the first REPLAY_CLOCK, where that is the time source.
+    beginnings, steps_back : int
+        Logs that began; times that the receive stamps stepped back.
     """
 
     frames: int
@@ -99,7 +109,7 @@ class Pipeline:
     is_replay : bool
         Whether bus time is a replay's.
     stamp_shift_s : float
-        Part of the frames' stamps that their clock does not have, since it was set [s].
+        What is added to the frames' stamps since their clock was set [s].
     latest_sample : Sample or None
     published : Estimate
         The one in the frames made last: `latest`, or at a heartbeat what is true of it then.
@@ -226,10 +236,11 @@ class Pipeline:
             cells.update(self.estimator.pack_tick(sample), volts, changes)
 
     def _note_voltage(self, sample: Sample) -> None:
-        """Judge whether samples lack the voltage lastingly, though its frames may come.
+        """Note whether samples lack the voltage lastingly, though its frames may come.
 
-        They do when several in a row have none and the last one that had is too old for a voltage:
-        one that is sent less often than the current is in few samples.
+        They do when several consecutive samples have no voltage, and the last voltage is older than
+        its time-out. The number alone is not enough: a voltage that is sent less often than the
+        current is in few samples.
         """
         if not math.isnan(sample.voltage_v):
             self._voltage_s, self._without_voltage = sample.time_s, 0
@@ -313,8 +324,9 @@ class Pipeline:
         silent_s : float
             Time since the latest sample that the estimator took [s].
         timeout_s : float
-            The estimate is stale after a longer silence [s]. With receive stamps it is not between
-            two samples of a slow source, and after the current's own time-out in any case.
+            Longest silence at which the estimate is still fresh [s]. With receive stamps it is
+            raised to some periods of the current (`MISSED_AT_LEAST`), so that a slow source does
+            not make the estimate stale. It is then at most the current's own time-out.
         reasons : Reason
             Findings of the loop.
         """
@@ -332,8 +344,8 @@ class Pipeline:
             reasons |= estimate.reasons
             estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
         if estimate.status is Status.INVALID:
-            # What was not counted since the latest sample: little where samples come, and the model
-            # or the sign is what invalidates them.
+            # Widen by the charge that was not counted in the silence. It is little while samples
+            # come: the estimate is then invalid by its model or sign.
             missing_pct = self.estimator.uncounted_std_pct(silent_s)
             std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
             estimate = estimate._replace(soc_std_pct=std_pct)
@@ -347,11 +359,11 @@ class Pipeline:
         """Continue with another configuration, from the SoC known so far.
 
         Unchanged parts keep their state bit for bit. A changed model or estimator setting makes a
-        new estimator, which takes over SoC and delay line. Where current or voltage are decoded
-        otherwise, that SoC is of another battery, or wrong: the first voltages give it. Initial
-        SoC, its standard deviation, the time source and REPLAY_CLOCK's id stay. InputError, and no
-        change, if a frame to publish has the id of a vehicle's signal, or settings contradict the
-        model.
+        new estimator, which takes over SoC and delay line. Where the decoding of current or voltage
+        changed, that SoC is wrong or of another battery: the new estimator starts from the first
+        voltages. Otherwise initial SoC and its standard deviation stay. The time source and
+        REPLAY_CLOCK's id always stay. InputError, and no change, if a frame to publish has the id
+        of a vehicle's signal, or settings contradict the model.
         """
         old, before = self.settings, self.estimator
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
@@ -432,13 +444,13 @@ def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
 
 
 def _all_reasons(
-    estimate: Reason,
-    signals: Reason,
+    of_estimate: Reason,
+    of_signals: Reason,
     lacks_voltage: bool,
     is_refused: bool,
 ) -> Reason:
     """Return the reasons of an estimate, with the findings about its inputs."""
-    reasons = (estimate & ~Reason.VOLTAGE_MISSING) | signals
+    reasons = (of_estimate & ~Reason.VOLTAGE_MISSING) | of_signals
     if lacks_voltage:
         reasons |= Reason.VOLTAGE_MISSING
     if is_refused:
