@@ -111,7 +111,7 @@ class SocFilter:
     evidence : float
         Sum of the log-likelihoods of all voltages, which compares starts.
     bias : SeparateBias
-        Capacity and resistance, learned beside the state.
+        Capacity and resistance, learned beside the state by Friedland's filter.
     """
 
     def __init__(self, model: OnlineModel, soc_pct: float, soc_std_pct: float) -> None:
@@ -173,20 +173,20 @@ class SocFilter:
         """Correct the state by the mean voltage of a block."""
         prior, x = self.x, self.x
         iterations = ITERATIONS_AT_MOST if self.P[SOC, SOC] > LINEAR_PCT**2 else 1
-        part, last_pct = 1.0, 0.0
+        damping, last_step_pct = 1.0, 0.0
         for _ in range(iterations):
             voltage_v, H, R = self.measurement(x, block)
             PHt = self.P @ H
             self.S = float(H @ PHt) + R
             K = PHt / self.S
             self.y = block.voltage_v - voltage_v - float(H @ (prior - x))
-            to = prior + K * self.y
-            to[SOC] = min(max(to[SOC], LOWEST_PCT), HIGHEST_PCT)
-            step_pct = float(to[SOC] - x[SOC])
-            if step_pct * last_pct < -0.5 * last_pct**2:
-                part *= 0.5  # Damp: full Newton steps oscillate across a kink.
-            last_pct = step_pct
-            x = to if part == 1.0 else x + part * (to - x)
+            target = prior + K * self.y
+            target[SOC] = min(max(target[SOC], LOWEST_PCT), HIGHEST_PCT)
+            step_pct = float(target[SOC] - x[SOC])
+            if step_pct * last_step_pct < -0.5 * last_step_pct**2:
+                damping *= 0.5  # Full Newton steps oscillate across a kink.
+            last_step_pct = step_pct
+            x = target if damping == 1.0 else x + damping * (target - x)
             if abs(step_pct) < CLOSE_PCT:
                 break
         self.x = x
@@ -213,12 +213,12 @@ class SocFilter:
         A = noise.cold(temperature_c)
         volts, slope = model.pseudo_ocv_at(float(x[SOC]), block.drives)
         slope = max(slope, LEAST_SLOPE)
-        axis_v = noise.soc_std_pct * slope
+        soc_axis_v = noise.soc_std_pct * slope
         low_c, high_c = model.model.range.temperature_c
         outside_k = max(low_c - temperature_c, temperature_c - high_c, 0.0)
         lasting_v = (
             A * noise.level_std_v,
-            axis_v,
+            soc_axis_v,
             OUTSIDE_PCT_PER_K * outside_k * slope,
             model.unknown_temperature_v(block.load) if is_missing else 0.0,
         )
@@ -227,7 +227,7 @@ class SocFilter:
         H[LEVEL] = math.hypot(*lasting_v)
         H[FUNCTIONS:] = model.functions.row(float(x[SOC]), block.load)
         volts += float(block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:])
-        return volts, H, (A * noise.fast_std_v) ** 2 + axis_v**2 + block.unseen_v2
+        return volts, H, (A * noise.fast_std_v) ** 2 + soc_axis_v**2 + block.unseen_v2
 
     def soc_after(
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0

@@ -109,6 +109,7 @@ class Estimator:
         self.hypotheses = Hypotheses(self.online)
         self._clock = EstimatorClock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
+        # The counter where the filter is predicted to, and where the counted SoC starts.
         self._filter_at = self._coulomb_at = replace(self._counter)
         self._block = BlockState()
         self._memory = EstimatorMemory()
@@ -465,7 +466,7 @@ class Estimator:
         Parameters
         ----------
         stamp_shift_s : float
-            Part of the latest stamps that those after the restart will not have [s].
+            What is added to the latest stamps, and not to those after the restart [s].
         """
         latest = self.estimate
         return EstimatorState.model_construct(

@@ -52,7 +52,7 @@ from cangauge.model.voltage_model import DELAYS_S, KNOTS_PCT, Ranges
 Equation = Literal["knots", "published"]
 
 RELINEARIZED: Final = 4
-"""Linearizations about the fitted effects: products of effects and resistances have converged."""
+"""Gauss–Newton steps of a fit with effects: enough for products of effects and resistances."""
 
 CELLS_TOLERANCE: Final = 0.1
 """Voltage of a cell relative to the nearer typical one, from which the number of cells must be
@@ -221,7 +221,14 @@ def _check_logs(logs: Sequence[Log]) -> None:
 def _capacity_of(
     logs: Sequence[Log], starts_pct: Sequence[float | None], stated: float | str | None
 ) -> float:
-    """Return the capacity: stated, from a full discharge, or from the logs' own SoC [Ah]."""
+    """Return the capacity: stated, from a full discharge, or from the logs' own SoC [Ah].
+
+    Raises
+    ------
+    InputError
+        If the capacity is not positive, or charge and SoC of a log without a stated start
+        contradict each other.
+    """
     if stated is None:
         capacity_ah = capacity_from_full_discharge(logs, starts_pct)
     elif isinstance(stated, str):
@@ -408,18 +415,18 @@ def knots_file(
     held_out_v: Sequence[FloatArray] = (),
     rows: Sequence[FitRows] = (),
 ) -> Model:
-    """Return the model file of a solution.
+    """Return the model of a solution.
 
     Parameters
     ----------
     solution : Solution
-        Its covariance and scale are final.
+        With its covariance already scaled by left-out logs.
     fields : dict
         The other fields of `Model`.
     held_out_v : sequence of array of shape (m,)
-        Errors of left-out logs [V]; the model states those of the fit itself by default.
+        Errors of left-out logs [V], which the model states; by default it states those of the fit.
     rows : sequence of FitRows
-        Theirs.
+        Rows of `held_out_v`.
     """
     # The square root of the precision, and the names of its columns.
     root = np.linalg.cholesky(np.linalg.inv(solution.covariance)).T
@@ -431,7 +438,7 @@ def knots_file(
         root=np.triu(root).tolist(),
         projected=(root @ solution.coefficients).tolist(),
     )
-    judged = _judged(held_out_v, rows, solution.residual_v, solution.mean_v)
+    judged = _stated_error(held_out_v, rows, solution.residual_v, solution.mean_v)
     return Model.of_knots(solution, judged, information=information, **fields)
 
 
@@ -455,7 +462,7 @@ def _fit_published(
         errors_v.append(item.voltage_v - item.linear(equation.columns, without.coefficients))
     errors = _held_out(rows, errors_v)
     mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
-    judged = _judged(errors, rows, published.residual_v, mean_v)
+    judged = _stated_error(errors, rows, published.residual_v, mean_v)
     jacobian, found = published.jacobian(), published.fields()
     covariance = jacobian @ published.covariance @ jacobian.T
     model = Model(
@@ -471,13 +478,13 @@ def _fit_published(
 
 
 def _held_out(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-    """Return the errors of each log by the other logs [V], NaN where these have no SoC.
+    """Return errors of left-out logs [V], NaN at SoC outside the range of the other logs.
 
     Parameters
     ----------
     rows : sequence of FitRows
     errors_v : sequence of array of shape (m,)
-        Of each log by the others [V]; none for too few logs.
+        Error of each log by the model of the others [V]; empty for too few logs.
     """
     lows = [float(item.soc_pct.min()) for item in rows]
     highs = [float(item.soc_pct.max()) for item in rows]
@@ -490,7 +497,7 @@ def _held_out(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[
     return tuple(found)
 
 
-def _judged(
+def _stated_error(
     held_out_error_v: Sequence[FloatArray],
     rows: Sequence[FitRows],
     residual_v: float,

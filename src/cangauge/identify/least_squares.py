@@ -1,12 +1,12 @@
-"""Weighted least squares of the curve of knots, from sums of each log, with the prior's rows.
+"""Posterior of the curve of knots and its loads: weighted least squares with a Gaussian prior.
 
     U = g(S) + kt·(T − T_r) + Σm Rm·Im + b·(a(T)/a(T̄) − 1)·Σm R⁰m·Im + Σe αe·xe + level + noise
 
-The fit needs of a log only its second moments (`LogSums`), so that logs left out and logs pooled
-are sums. A row counts for its time, less where its percent of SoC is full of rows or where the
-curve is so steep that the error of SoC dominates. Rows of a minute count as one independent datum.
-The level of each log is eliminated. R⁰ are the resistances of the fit before, so the equation is
-linear; the noise variance is a fixed point.
+The fit needs of a log only its second moments (`LogSums`): those of several logs are a sum. The
+weight of a row is its time. It is less where the log has many rows within the same percent of SoC,
+and where the curve is so steep that the error of SoC dominates. The rows of a minute together count
+as one independent datum. The level of each log is eliminated. R⁰ are the resistances of the
+iteration before, so the equation is linear. The noise variance is a fixed point.
 """
 
 from __future__ import annotations
@@ -108,16 +108,17 @@ def row_weights(soc_pct: FloatArray, row_s: float, chemistry: Chemistry) -> Floa
     chemistry : Chemistry
     """
     inside = (soc_pct > -1.0) & (soc_pct < 101.0)
-    percent = np.clip(np.floor(soc_pct) + 1.0, 0.0, 102.0).astype(np.uint8)
+    soc_bin = np.clip(np.floor(soc_pct) + 1.0, 0.0, 102.0).astype(np.uint8)
     counted_s = min(row_s, SECONDS_PER_DATUM)
-    full_s = counted_s * np.bincount(percent, minlength=103)
-    share = np.minimum(1.0, SECONDS_PER_PERCENT / np.maximum(full_s, counted_s))
+    bin_s = counted_s * np.bincount(soc_bin, minlength=103)
+    share = np.minimum(1.0, SECONDS_PER_PERCENT / np.maximum(bin_s, counted_s))
     curve = chemistry.curve_v / np.interp(50.0, KNOTS_PCT, chemistry.curve_v)
-    steep = np.interp(soc_pct, KNOTS_PCT, np.gradient(curve, KNOTS_PCT))
-    steep *= chemistry.soc_std_pct / RESIDUAL_STD
-    steep *= steep
-    steep += 1.0
-    return np.asarray(counted_s * share[percent] * inside / steep)
+    # Variance of a row by noise and error of SoC, over that by noise; in place, as rows are many.
+    variance = np.interp(soc_pct, KNOTS_PCT, np.gradient(curve, KNOTS_PCT))
+    variance *= chemistry.soc_std_pct / RESIDUAL_STD
+    variance *= variance
+    variance += 1.0
+    return np.asarray(counted_s * share[soc_bin] * inside / variance)
 
 
 def features(soc_pct: FloatArray, temperature_c: FloatArray, currents_a: FloatArray) -> FloatArray:
@@ -320,15 +321,15 @@ def solve_without(
 def left_out(
     sums: Sequence[LogSums], without: Sequence[Solution], chemistry: Chemistry
 ) -> tuple[float, float]:
-    """Return what left-out logs show of the stated uncertainty.
+    """Return how errors of left-out logs compare with those that the posterior states.
 
     Returns
     -------
     scale : float
-        κ²: mean squares of their errors over those stated, 1 at least.
+        κ²: mean of their squared mean residuals, each over its stated variance; 1 at least.
     strain : float
-        Mean of `Solution.strain_of` over its mean under the model, 1 at most. The prior's logs have
-        1, so that it is two fifths or more.
+        Mean of `Solution.strain_of`, over κ² and over its mean under the model; 1 at most. The
+        prior's logs have 1, so that it is two fifths or more.
     """
     squares, strains = [], []
     for item, other in zip(sums, without, strict=False):

@@ -8,7 +8,8 @@ A row passes these rules, in this order:
 3. Delay line: rows within the longest delay (70 s) of the log's start, or of the end of a gap in
    the current longer than usual (`logs.gaps.usual_gap_s`), are removed.
 
-Their quantized temperature is interpolated between its steps, which looks ahead: offline only.
+The quantized temperature of the rows is interpolated between its steps. This uses later samples,
+and is possible offline only.
 """
 
 from __future__ import annotations
@@ -211,7 +212,7 @@ def fit_rows(
 
 
 def start_of(log: Log) -> tuple[int, float]:
-    """Return row and value of the first known SoC of a log of a fit [%]: every one has it."""
+    """Return index and value [%] of a log's first known SoC; ValueError without one."""
     start = log.first_soc()
     if start is None:
         raise ValueError("a log of a fit has a start")
@@ -259,13 +260,15 @@ def usable_rows(
     """Return the indices of the rows of a log that take part in a fit, and the numbers removed."""
     ticks = decimate(log.time_s, rate_hz)
     running = running_rows(log.time_s, log.voltage_v)[ticks]
-    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, GAP_S))
+    is_filled = filled_at(
+        log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, GAP_S)
+    )
     removed = {
         "decimation": len(log) - ticks.size,
         "start_up_or_shut_down": int(np.sum(~running)),
-        "delay_line_filling": int(np.sum(running & ~full)),
+        "delay_line_filling": int(np.sum(running & ~is_filled)),
     }
-    return ticks[running & full], removed
+    return ticks[running & is_filled], removed
 
 
 def dequantize(log: Log) -> Log:

@@ -161,7 +161,10 @@ def _cubic_at(knots: Sequence[float], soc_pct: float) -> _Cubic:
 
 
 def hermite_basis(soc_pct: FloatArray, knots_pct: FloatArray = KNOTS_PCT) -> FloatArray:
-    """Return d g/d values at the knots [-], shape (n, knots), for SoC [%] of shape (n,)."""
+    """Return the derivatives of the curve by its values at the knots [-], shape (n, knots).
+
+    `soc_pct` is the SoC [%] of shape (n,).
+    """
     bend = hermite_slopes(knots_pct, np.eye(knots_pct.size))
     left, (h00, h10, h01, h11), _ = _cubics(knots_pct, soc_pct)
     basis = h10[:, None] * bend[left] + h11[:, None] * bend[left + 1]
@@ -188,8 +191,8 @@ class HermiteCurve:
     @classmethod
     def rising(cls, soc_pct: FloatArray, value: FloatArray) -> HermiteCurve:
         """Return the curve through values at knots, changed only where it would not rise."""
-        middle = float(np.interp(50.0, soc_pct, value))
-        least = SLOPE_AT_LEAST * abs(middle)
+        at_half_v = float(np.interp(50.0, soc_pct, value))
+        least = SLOPE_AT_LEAST * abs(at_half_v)
         value = np.maximum.accumulate(value - least * soc_pct) + least * soc_pct
         slope = hermite_slopes(soc_pct, value)
         secant = np.diff(value) / np.diff(soc_pct)
@@ -198,8 +201,8 @@ class HermiteCurve:
         inner = _cubic(np.arange(secant.size), np.diff(soc_pct), np.array([0.0, 0.5, 1.0])[:, None])
         for _ in soc_pct:  # a changed slope can make the next interval fall
             # The slope between knots is a parabola in t: d0 + b t + a t², lowest at −b / 2a.
-            d0, middle, d1 = inner.sum(inner.slope, value, slope)
-            a, b = 2.0 * (d0 - 2.0 * middle + d1), 4.0 * middle - 3.0 * d0 - d1
+            d0, d_half, d1 = inner.sum(inner.slope, value, slope)
+            a, b = 2.0 * (d0 - 2.0 * d_half + d1), 4.0 * d_half - 3.0 * d0 - d1
             t = np.clip(np.divide(-b, 2.0 * a, out=np.zeros_like(a), where=a > 0.0), 0.0, 1.0)
             falls = np.minimum(np.minimum(d0, d1), d0 + (b + a * t) * t) <= 0.0
             if not falls.any():
@@ -230,7 +233,9 @@ class HermiteCurve:
 
 @dataclass(frozen=True, eq=False)
 class Functions:
-    """Joint principal functions of the covariance of all coefficients, of standard deviation 1.
+    """Principal components of the covariance of the curve's and the load's coefficients together.
+
+    A function is the part of a component in the voltage, at an amplitude of one standard deviation.
 
     Parameters
     ----------
@@ -488,7 +493,7 @@ class VoltageModel:
 
     @property
     def usual_c(self) -> float:
-        """Temperature where none is known [°C]: the mean of the logs, or T_r."""
+        """Temperature assumed where none is known [°C]: the mean of the logs, or else T_r."""
         loads = self.loads
         return loads.t_ref_c if loads.arrhenius is None else loads.arrhenius.mean_c
 
