@@ -84,28 +84,28 @@ class Diagnosis:
         return self.model_check is not None and bool(self.model_check.missed)
 
     @cached_property
-    def _given(self) -> ExtendedModel:
-        """The model that explains the healthy logs: the given one with what it misses there."""
+    def _healthy_extended(self) -> ExtendedModel:
+        """The model as given, extended by the effects that it misses on the healthy logs."""
         if self.model_check is not None and self.lacks:
             return self.model_check.corrected
         return self.model.extended_model()
 
     @cached_property
-    def _without(self) -> tuple[list[Simulated], list[LogErrors]]:
-        """Each log by that model, and its errors."""
-        return errors_without(self._given, self.rows)
+    def _before_correction(self) -> tuple[list[Simulated], list[LogErrors]]:
+        """Each diagnosed log as the model of the healthy logs predicts it, and its errors."""
+        return errors_without(self._healthy_extended, self.rows)
 
     @cached_property
     def _baseline(self) -> list[LogErrors]:
         """Errors of each log by the model as given."""
         if not self.lacks:
-            return self._without[1]
+            return self._before_correction[1]
         return errors_without(self.model.extended_model(), self.rows)[1]
 
     @cached_property
     def corrections(self) -> dict[str, Correction]:
         """Fault → its best effect, judged on rows that did not size it."""
-        parts, (given, without) = held_out(self.healthy, self.rows), self._without
+        parts, (given, without) = held_out(self.healthy, self.rows), self._before_correction
         return {
             fault: Correction.of(parts, self.rows, given, without, self.best_of(fault))
             for fault in self.posterior.faults
@@ -170,7 +170,8 @@ class Diagnosis:
     def _keeps_soc(self, correction: Correction) -> bool:
         """Whether the SoC error of these logs grows by no more than its scatter.
 
-        A step within these logs proves nothing: the corrected model has it from the first row on.
+        A step of resistance within these logs is not tested: the corrected model has the step from
+        the first row on, and is wrong before it.
         """
         if correction.evidence.shape.place is not None:
             return True
@@ -197,7 +198,9 @@ class Diagnosis:
     @property
     def log_errors(self) -> list[LogErrors]:
         """Errors of each diagnosed log, before and after."""
-        corrected = self._without[1] if self.correction is None else self.correction.errors
+        corrected = (
+            self._before_correction[1] if self.correction is None else self.correction.errors
+        )
         return [
             replace(before, after_v=log.after_v)
             for before, log in zip(self._baseline, corrected, strict=True)
@@ -272,11 +275,11 @@ class Diagnosis:
         """The model that describes the healthy logs: the given one where nothing is missed."""
         if not self.lacks:
             return self.model
-        return model_file(self.model, self._given, rms(self._without[1]))
+        return model_file(self.model, self._healthy_extended, rms(self._before_correction[1]))
 
     def _file(self, correction: Correction) -> Model:
         """Return the model of the healthy logs with a correction."""
-        return model_file(self.model, correction.applied(self._given), correction.rmse_v)
+        return model_file(self.model, correction.applied(self._healthy_extended), correction.rmse_v)
 
     @property
     def summary(self) -> str:
@@ -393,7 +396,7 @@ def diagnose(
             simulator=simulator,
         )
         _LOG.info("judging on held-out rows")
-        found.to_json()  # computed here, on one thread
+        found.to_json()  # fills the cached properties while one thread is in use
         return found
 
 

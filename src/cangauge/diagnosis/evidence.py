@@ -59,10 +59,10 @@ class Evidence:
     visible: float
     """Smallest size that would have been visible."""
     chance: float
-    """Largest χ² of its shapes: about 1 without the effect."""
+    """χ² (one degree of freedom) of its most significant shape: about 1 without the effect."""
     places: Places
     bounds: tuple[float, float]
-    """Of the amplitude, in larger bounds of the shape."""
+    """Lowest and highest amplitude relative to neutral, in units of the shape's larger bound."""
 
     @property
     def fault(self) -> str:
@@ -184,6 +184,7 @@ def learn(model: Model, references: Sequence[Trace]) -> Healthy:
         return replace(healthy, known=known, s2=max(healthy.s2, stated_v2))
     chance = {name: np.array([one[name].chance for one in left_out]) for name in left_out[0]}
     usual = max(1.0, float(np.median([x.mean() for x in chance.values()])))
+    # Two more references of the usual χ² keep the mean of few from being far off.
     excess = {k: max((x.sum() + 2.0 * usual) / (len(x) + 2.0), usual) for k, x in chance.items()}
     nats = [max(0.0, *(e.nats / excess[name] for name, e in one.items())) for one in left_out]
     return replace(

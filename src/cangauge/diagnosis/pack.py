@@ -6,8 +6,9 @@ One linear model of all logs about the given model:
 
 r [V] is the measured minus the modelled voltage. δ corrects the coefficients of the model (curve,
 temperature, resistances: the columns and the prior of the fit) and adds the effects of a pack in
-physical sizes. b_l ~ N(0, 1) is what one healthy log may differ by. c_k is the column of a shape of
-a fault, and a_k its size.
+physical sizes. b_l ~ N(0, 1) are nuisance parameters: what one healthy log may differ by. c_k is
+the column of a shape of a fault, and a_k its size. A fault has one or more effects, and an effect
+one or more shapes. In a shape one amplitude of the effect is free, its other parameters are fixed.
 
 References, logs without a fault, give δ. Left out one at a time they give s², the error of a
 healthy log, and the excess o_k ≥ 1 by which their evidence of an effect exceeds chance. The noise
@@ -32,10 +33,10 @@ from cangauge.model.gaussian import Rows
 from cangauge.model.model_file import Model
 
 STRUCTURES: Final = (0.003, 0.009, 0.03, 0.09)
-"""Standard deviation of a healthy pack's effect, in bounds: the one of these that predicts left-out
-references best; …"""
+"""Candidates for the standard deviation of a healthy pack's effects, relative to their bounds."""
 CURVES: Final = (0.1, 0.3, 1.0)
-"""… and how far the curve may differ from the chemistry's, in its standard deviations, likewise."""
+"""Candidates for the standard deviation of the curve about its level, relative to the prior's. The
+pair of candidates that predicts left-out references best is used."""
 
 UNSETTLED: Final = {150.0: 0.01, 1200.0: 0.01}
 """Times over which a pack settles after the start of a log [s], and the part of the drop at 1 C by
@@ -113,10 +114,10 @@ def log_rows(
                 for k, each in enumerate(tried)
                 if each.healthy_std
             ),
-            *_beside(linear, log.log.time_s[log.rows] - log.log.time_s[0], soc),
+            *_nuisance_columns(linear, log.log.time_s[log.rows] - log.log.time_s[0], soc),
         ]
     )
-    delta = np.column_stack([linear.columns(of), by_shape[:, _structure(tried)]])
+    delta = np.column_stack([linear.columns(of), by_shape[:, _healthy_shapes(tried)]])
     every = np.column_stack([deviations, delta, by_shape, residual_v])
     table = every[kept] * np.sqrt(log.weights[kept])[:, None]
     rows = Rows.of(table[:, :-1], table[:, -1], 1.0)
@@ -125,8 +126,8 @@ def log_rows(
     return LogRows(log, of, deviations.shape[1], soc, kept, table, rows, change, counts)
 
 
-def _beside(linear: Linear, time_s: FloatArray, soc_pct: FloatArray) -> list[FloatArray]:
-    """Return what healthy logs differ by beside effects: an unsettled start, and the knee [V]."""
+def _nuisance_columns(linear: Linear, time_s: FloatArray, soc_pct: FloatArray) -> list[FloatArray]:
+    """Return what healthy logs differ by besides effects [V]: an unsettled start, and the knee."""
     drop_v = linear.pack.resistance_ohm * linear.pack.capacity_ah
     unsettled = [part * drop_v * np.exp(-time_s / tau_s) for tau_s, part in UNSETTLED.items()]
     knee = np.exp(-np.clip(soc_pct, -4.0, 100.0) / KNEE_PCT)
@@ -141,8 +142,8 @@ def _count_by(shape: Shape, of: Simulated, plain: tuple[float, float] | None) ->
     return 0.0 if now is None else (plain[1] - now[1]) * shape.bound / shape.about
 
 
-def _structure(tried: Sequence[Shape]) -> IntArray:
-    """Return the shapes that a healthy pack has too; every other one: neighbours are alike."""
+def _healthy_shapes(tried: Sequence[Shape]) -> IntArray:
+    """Return the indices of shapes that a healthy pack has too: every second, as they are alike."""
     return np.array([k for k, shape in enumerate(tried) if shape.is_of_pack][::2], dtype=np.intp)
 
 
@@ -162,7 +163,7 @@ class Healthy:
     mean_squares_v2: tuple[float, ...] = ()
     """Of each left-out reference [V²]."""
     known_v2: float = 0.0
-    """Mean variance of left-out references by what the others leave open [V²]."""
+    """Variance of the prediction of a left-out reference by the others, mean of all [V²]."""
     nats: tuple[float, ...] = ()
     """Most evidence of any effect in each left-out reference [nats]."""
     excess: dict[str, float] = field(default_factory=dict)
@@ -211,16 +212,22 @@ class Healthy:
         return sum(self.square_v2(log, delta) for log in logs) / total_s(logs)
 
     def open_v2(self, logs: Sequence[LogRows]) -> float:
-        """Return the mean variance of logs by what references leave open [V²]."""
+        """Return the mean variance of the predicted voltage of logs by the covariance of δ [V²]."""
         root = self.known.posterior().root
         tables = [log.rows.table[:, log.m : log.m + self.n] for log in logs]
         return sum(float(np.sum((table @ root) ** 2)) for table in tables) / total_s(logs)
 
     def own_soc(self, log: LogRows, soc_pct: FloatArray) -> tuple[float, float]:
-        """Return by how much the counted and the log's own change of SoC differ, and its σ [%].
+        """Return the counted less the log's own change of SoC [σ], and this σ [%].
 
-        `soc_pct` is the counted SoC of all rows of the log. The difference is in σ, and 0 where
-        that of the log as it is does not stand out.
+        The own change is scaled by `soc_ratio`. The difference is 0 where that without any effect
+        does not stand out.
+
+        Parameters
+        ----------
+        log : LogRows
+        soc_pct : array of shape (n,)
+            Counted SoC of all rows of the log, with or without an effect [%].
         """
         change = log.trace.own_change(soc_pct)
         if log.own_change is None or change is None:
@@ -256,7 +263,7 @@ def _prior_rows(
     mean: FloatArray, covariance: FloatArray, structure: float, tried: Sequence[Shape]
 ) -> Rows:
     """Return the rows of the prior of δ: coefficients, then a healthy pack's effects."""
-    p, q = mean.size, _structure(tried).size
+    p, q = mean.size, _healthy_shapes(tried).size
     scale = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-9 * np.eye(p))
     whitened = np.linalg.solve(root, np.diag(1.0 / scale))
@@ -267,10 +274,11 @@ def _prior_rows(
 
 
 def correct(model: Model, references: Sequence[Trace]) -> tuple[Healthy, list[LogRows], list[bool]]:
-    """Return the healthy pack by references, without them in it; and which of them count.
+    """Return the healthy pack, the rows of its references, and which of these can be judged.
 
-    The model is corrected by the references, by the prior of the fit. The effects that a pack has
-    are as large as predicts left-out references best.
+    The model is corrected to the posterior mean of all references, with the prior of the fit.
+    `known` has the rows of the prior only: `learn` adds those of the references. A reference can be
+    left out and judged where the others visit enough of its SoC.
     """
     given = Linear.of(model)
     first = [log_rows(given, log, (), []) for log in references]
@@ -283,7 +291,7 @@ def correct(model: Model, references: Sequence[Trace]) -> tuple[Healthy, list[Lo
     healthy = Healthy(given, (), _prior_rows(*prior, 1.0, ()), (FIRST_NOISE * mean_v) ** 2)
     every = [len(first) > 1] * len(first)
     for _ in range(2):
-        healthy = _predicting(healthy, first, every, prior, least_v2)
+        healthy = _tuned(healthy, first, every, prior, least_v2)
     rows = total(healthy.known, [healthy.rows_of(log) for log in first])
     linear = given.moved(rows.posterior().mean)
     tried, visited = _tried(linear), [log.soc_pct for log in first]
@@ -303,7 +311,7 @@ def correct(model: Model, references: Sequence[Trace]) -> tuple[Healthy, list[Lo
         soc_ratio=_soc_ratio(logs),
     )
     for _ in range(2):
-        healthy = _predicting(healthy, logs, counts, prior, least_v2)
+        healthy = _tuned(healthy, logs, counts, prior, least_v2)
     return healthy, logs, counts
 
 
@@ -312,14 +320,14 @@ def total(known: Rows, logs: Sequence[Rows]) -> Rows:
     return Rows(np.concatenate([known.table, *(rows.table for rows in logs)]), 0.0).reduced()
 
 
-def _predicting(
+def _tuned(
     healthy: Healthy,
     logs: Sequence[LogRows],
     counts: Sequence[bool],
     prior: tuple[FloatArray, FloatArray],
     least_v2: float,
 ) -> Healthy:
-    """Return the prior that predicts left-out references best, and the noise that they show."""
+    """Return the healthy pack with the prior and noise that predict left-out references best."""
     every = [_gram(healthy.rows_of(log).with_columns(range(healthy.n))) for log in logs]
     whole = np.sum(every, axis=0)
     judged = [k for k, is_judged in enumerate(counts) if is_judged]

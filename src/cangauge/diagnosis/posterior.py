@@ -4,9 +4,9 @@
     P(fault | gap) ∝ (mean over its effects of e^u_k)^γ
 
 with n_k/o_k the evidence of effect k over what healthy logs show of it, V_k the mean square error
-that it leaves, v that of a healthy log, and n_max the largest evidence of any effect. The first two
-say little between the effects of a large fault, which all explain much of it; the third is what
-they lack.
+that it leaves, v that of a healthy log, and n_max the largest evidence of any effect. Where a fault
+is large, many effects explain much of it, and the first two terms hardly tell them apart. The third
+does: it is the evidence that an effect lacks against the best one.
 
 The faults compete with each other, and together with `none` and `unknown` (nested logit: Train,
 Discrete Choice Methods with Simulation, 2nd ed., 2009, ch. 4). w, γ and the weights of the outer
@@ -50,8 +50,9 @@ ALIKE: Final = {
 """What is off → faults that make it so and look alike over a narrow SoC or temperature."""
 
 UNTESTED: Final = 3.0
-"""A healthy log may have this many times the error that a model file states: it is of other logs,
-and no left-out reference shows how much logs differ."""
+"""Assumed where no left-out reference shows how much healthy logs differ: a healthy log has this
+many times the RMS error that the model file states, and this many nats of evidence of some
+effect."""
 
 
 @cache
@@ -142,8 +143,8 @@ class Posterior:
         They sum to 1.
     alarm : float
         P(none) up to which a gap is reported.
-    stated : float
-        P(fault) within the gap from which it is stated alone.
+    stated_from : float
+        P(fault | gap) from which a fault is stated alone.
     """
 
     probabilities: Mapping[str, float]
@@ -192,7 +193,10 @@ class Posterior:
 
     @cached_property
     def stated(self) -> tuple[str, ...]:
-        """The fault that is stated; two where none is sure enough; none without a gap."""
+        """Faults that are stated: the likeliest, with the second where it is not sure enough.
+
+        Empty without a gap, and where `unknown` has more than half of the gap's probability.
+        """
         if self.level == "none" or 2.0 * self.unknown > 1.0 - self.none:
             return ()
         first, second, *_ = self.faults
@@ -211,7 +215,7 @@ class Posterior:
         return next(iter(sure), None)
 
     def within_gap(self, fault: str) -> float:
-        """Return the probability of a fault where there is a gap."""
+        """Return P(fault | gap), the gap being every case but `none`."""
         return self.faults[fault] / max(1.0 - self.none, 1e-12)
 
 
