@@ -81,7 +81,10 @@ def test_limits_of_a_pack_hold_where_none_are_stated() -> None:
     assert (voltage.lowest, voltage.highest) == (200.0, 500.0)
     warm = SignalChecks().within_pack("temperature", pack)
     assert (warm.lowest, warm.highest, warm.max_jump, warm.max_rate_per_s) == (-60, 120, 5, 1)
-    assert SignalChecks().within_pack("current", pack).highest == 5000.0
+    current = SignalChecks().within_pack("current", pack)
+    assert (current.lowest, current.highest) == (-4000.0, 4000.0)  # a short circuit
+    stiff = PackProperties(0.01, 0.5, 50.0, usual_v=400.0)
+    assert SignalChecks().within_pack("current", stiff).highest == 5000.0
 
 
 def test_a_stated_time_out_is_exact() -> None:

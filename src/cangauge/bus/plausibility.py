@@ -31,7 +31,6 @@ STUCK_AFTER_S: Final = 10.0
 """Least time of a constant value [s]: a pack at rest between two pulses is constant for less."""
 _LIMITS: Final[dict[str, dict[str, float]]] = {
     "soc_reference": {"lowest": SOC_WITHIN_PCT[0], "highest": SOC_WITHIN_PCT[1]},
-    "current": {"lowest": -CURRENT_AT_MOST_A, "highest": CURRENT_AT_MOST_A},
     "temperature": {
         "lowest": TEMPERATURE_WITHIN_C[0],
         "highest": TEMPERATURE_WITHIN_C[1],
@@ -67,6 +66,11 @@ class PackProperties:
     error_std_v: float
     capacity_ah: float
     usual_v: float
+
+    @property
+    def short_circuit_a(self) -> float:
+        """Current that no state of the pack exceeds [A], at most `CURRENT_AT_MOST_A`."""
+        return self.usual_v / max(self.resistance_ohm, self.usual_v / CURRENT_AT_MOST_A)
 
 
 Positive = Annotated[FiniteFloat, Field(gt=0.0)]
@@ -113,6 +117,8 @@ class SignalChecks(BaseModel):
         if role == "voltage" and pack is not None:
             low, high = VOLTAGE_WITHIN
             limits = {"lowest": low * pack.usual_v, "highest": high * pack.usual_v}
+        if role == "current" and pack is not None:
+            limits = {"lowest": -pack.short_circuit_a, "highest": pack.short_circuit_a}
         return self.model_copy(update={**limits, **self.model_dump(exclude_unset=True)})
 
 
