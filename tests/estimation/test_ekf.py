@@ -159,7 +159,7 @@ def test_covariance_stays_positive_and_shrinks(seed: int, start_std_pct: float) 
 def test_prediction_between_blocks_equals_the_filters_own() -> None:
     filter_ = SocFilter(LinearModel(), 60.0, 5.0)
     run(filter_, voltages(5, 4))
-    soc_pct, variance = filter_.soc_after(17.0, 0.4, 0.02)
+    soc_pct, variance = filter_.soc_moments_after(17.0, 0.4, 0.02)
     by_biases_pct = filter_.bias.V[0] @ filter_.bias.b
     filter_.predict(17.0, 0.4, 0.02)
     assert soc_pct == pytest.approx(filter_.x[0], abs=1e-12)

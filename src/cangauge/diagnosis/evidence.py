@@ -58,7 +58,7 @@ class Evidence:
     """Its standard deviation by noise and excess."""
     visible: float
     """Smallest size that would have been visible."""
-    chance: float
+    chi2: float
     """χ² (one degree of freedom) of its most significant shape: about 1 without the effect."""
     places: Places
     bounds: tuple[float, float]
@@ -133,7 +133,7 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
             size=float(size[top]) * shape.bound,
             std=float(np.sqrt(o / (s[top] + RIDGE))) * shape.bound,
             visible=float(visible.min()),
-            chance=float(np.max(g[mine] ** 2 / (s[mine] + RIDGE))),
+            chi2=float(np.max(g[mine] ** 2 / (s[mine] + RIDGE))),
             places=places,
             bounds=(float(bounds[top, 0]), float(bounds[top, 1])),
         )
@@ -182,16 +182,16 @@ def learn(model: Model, references: Sequence[Trace]) -> Healthy:
     if len(left_out) < 2:
         stated_v2 = model.noise.voltage_rmse_v**2
         return replace(healthy, known=known, s2=max(healthy.s2, stated_v2))
-    chance = {name: np.array([one[name].chance for one in left_out]) for name in left_out[0]}
-    usual = max(1.0, float(np.median([x.mean() for x in chance.values()])))
+    chi2 = {name: np.array([one[name].chi2 for one in left_out]) for name in left_out[0]}
+    usual = max(1.0, float(np.median([x.mean() for x in chi2.values()])))
     # Two more references of the usual χ² keep the mean of few from being far off.
-    excess = {k: max((x.sum() + 2.0 * usual) / (len(x) + 2.0), usual) for k, x in chance.items()}
+    excess = {k: max((x.sum() + 2.0 * usual) / (len(x) + 2.0), usual) for k, x in chi2.items()}
     nats = [max(0.0, *(e.nats / excess[name] for name, e in one.items())) for one in left_out]
     return replace(
         healthy,
         known=known,
         mean_squares_v2=tuple(gap_v2 for gap_v2, _ in judged),
-        known_v2=float(np.mean([open_v2 for _, open_v2 in judged])),
+        mean_open_v2=float(np.mean([open_v2 for _, open_v2 in judged])),
         nats=tuple(nats),
         excess=excess,
     )

@@ -162,7 +162,7 @@ class Healthy:
     """SoC of each reference [%]."""
     mean_squares_v2: tuple[float, ...] = ()
     """Of each left-out reference [V²]."""
-    known_v2: float = 0.0
+    mean_open_v2: float = 0.0
     """Variance of the prediction of a left-out reference by the others, mean of all [V²]."""
     nats: tuple[float, ...] = ()
     """Most evidence of any effect in each left-out reference [nats]."""

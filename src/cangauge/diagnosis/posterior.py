@@ -83,7 +83,7 @@ def features(
     healthy: Healthy, logs: Sequence[LogRows], evidence: Mapping[str, Evidence]
 ) -> Features:
     """Return what the posterior sees of a case."""
-    v = healthy.healthy_v2 + max(healthy.open_v2(logs) - healthy.known_v2, 0.0)
+    v = healthy.healthy_v2 + max(healthy.open_v2(logs) - healthy.mean_open_v2, 0.0)
     nats = {name: max(e.nats, 0.0) for name, e in evidence.items()}
     n_max = max(nats[name] * healthy.excess_of(name) for name in nats)
     effects = {}

@@ -91,9 +91,9 @@ class SocFilter:
     """Extended Kalman filter from one start; equations and symbols are in the module's docstring.
 
     `predict` moves the state over counted charge, `update` corrects it by the mean voltage of a
-    block, `correct` by a SoC that is known otherwise. Between blocks `soc_after` counts the SoC on.
-    x, P, F, Q, H, R, K, y and S are filterpy's names. Its prediction is used, and imported with the
-    first one: a service whose steps are compiled never makes one here.
+    block, `correct` by a SoC that is known otherwise. Between blocks `soc_moments_after` counts
+    the SoC on. x, P, F, Q, H, R, K, y and S are filterpy's names. Its prediction is used, and
+    imported with the first one: a service whose steps are compiled never makes one here.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ class SocFilter:
         volts += float(block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:])
         return volts, H, (A * noise.fast_std_v) ** 2 + soc_axis_v**2 + block.unseen_v2
 
-    def soc_after(
+    def soc_moments_after(
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
     ) -> tuple[float, float]:
         """Return the predicted SoC and its variance [%, %²] without changing the state.

@@ -165,9 +165,13 @@ class Hypotheses:
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
     ) -> tuple[float, float]:
         """Return the predicted SoC and its standard deviation [%], both hypotheses weighed."""
-        soc_pct, variance = self.filters[0].soc_after(seconds, discharged_pct, variance_pct2)
+        soc_pct, variance = self.filters[0].soc_moments_after(
+            seconds, discharged_pct, variance_pct2
+        )
         if len(self.filters) == 2:
-            wide_pct, wide_var = self.filters[1].soc_after(seconds, discharged_pct, variance_pct2)
+            wide_pct, wide_var = self.filters[1].soc_moments_after(
+                seconds, discharged_pct, variance_pct2
+            )
             p = 1.0 / (1.0 + math.exp(-self.log_odds))
             mean_pct = (1.0 - p) * soc_pct + p * wide_pct
             variance = (1.0 - p) * (variance + (soc_pct - mean_pct) ** 2) + p * (

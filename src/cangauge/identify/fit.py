@@ -363,7 +363,7 @@ def _fit_knots(
     joint = _Joint(*solve_scaled(sums, pack), rows)
     selected: Selected | None = None
     if effect_ids:
-        plain = knots_file(joint.solution, fields).extended_model()
+        plain = knots_model(joint.solution, fields).extended_model()
         search = Search(plain, rows, pack, effect_ids)
         while (selected := search.select()).chosen:
             with_effects = _with_effects(joint, selected, pack, fields)
@@ -374,7 +374,7 @@ def _fit_knots(
             search.refused += at_bound
     errors_v = joint.held_out_v()
     fields = fields | {"effects": effect_entries(joint.effects)}
-    model = knots_file(joint.solution, fields, errors_v, joint.rows)
+    model = knots_model(joint.solution, fields, errors_v, joint.rows)
     return model, published, errors_v, selected
 
 
@@ -386,7 +386,7 @@ def _with_effects(
 ) -> _Joint:
     """Return the fit with the selected effects: Gauss–Newton from `plain`, without effects."""
     solution, std = plain.solution, selected.amplitude_std
-    extended = knots_file(solution, fields).extended_model()
+    extended = knots_model(solution, fields).extended_model()
     amplitudes = np.zeros(std.size)
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
@@ -404,12 +404,12 @@ def _with_effects(
         solution = selected.clipped(solution)
         amplitudes = solution.coefficients[P:]
         effects = selected.effects(solution)
-        voltage = knots_file(solution, fields).voltage_model()
+        voltage = knots_model(solution, fields).voltage_model()
         extended = ExtendedModel(voltage, pack.capacity_ah, effects)
     return _Joint(solution, without, [item.rows for item in about], tables, volts, effects)
 
 
-def knots_file(
+def knots_model(
     solution: Solution,
     fields: dict[str, Any],
     held_out_v: Sequence[FloatArray] = (),

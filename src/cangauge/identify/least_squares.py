@@ -318,7 +318,7 @@ def solve_without(
     return [by_fold[k % count] for k in range(number)]
 
 
-def left_out(
+def left_out_calibration(
     sums: Sequence[LogSums], without: Sequence[Solution], chemistry: Chemistry
 ) -> tuple[float, float]:
     """Return how errors of left-out logs compare with those that the posterior states.
@@ -357,6 +357,6 @@ def solve_scaled(
     """Return the posterior scaled by left-out logs, and those of `solve_without`."""
     solution = solve(sums, pack, amplitude_std)
     without = solve_without(sums, pack, amplitude_std)
-    scale, strain = left_out(sums, without, pack.chemistry)
+    scale, strain = left_out_calibration(sums, without, pack.chemistry)
     covariance = solution.covariance * scale
     return replace(solution, covariance=covariance, scale=scale, strain=strain), without
