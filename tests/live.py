@@ -101,10 +101,13 @@ class LoggedLines(RateLimitedHandler):
         self._logger.setLevel(self._level)
         self.release_due(everything=True)
 
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Leave out other threads before the rate limit, which their lines would use up."""
+        return self._thread is None or record.thread == self._thread.ident
+
     def emit(self, record: logging.LogRecord) -> None:
-        if self._thread is None or record.thread == self._thread.ident:
-            begin = "warning: " if record.levelno >= logging.WARNING else ""
-            self.lines.append(begin + record.getMessage())
+        begin = "warning: " if record.levelno >= logging.WARNING else ""
+        self.lines.append(begin + record.getMessage())
 
 
 @dataclass
