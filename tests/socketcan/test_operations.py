@@ -22,7 +22,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder
 from cangauge.service.status import Monitor
 from cangauge.types import Estimate
-from live import Rows, leaf_model, short_log, waits
+from live import Rows, leaf_model, loop_config, short_log, waits
 from served import Served, Shown
 
 pytestmark = pytest.mark.socketcan
@@ -50,7 +50,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
         monitor = Monitor(pipeline, port, recorder=recorder)
         server = Served(monitor.latest, http="127.0.0.1:0")
         outputs = [Rows(rows), recorder, Shown(server)]
-        loop = Loop(port, pipeline, outputs=outputs, monitor=monitor)
+        loop = Loop(port, pipeline, loop_config(), outputs=outputs, monitor=monitor)
         thread = threading.Thread(target=loop.run, args=(stop.is_set,))
         thread.start()
         with closing(server):
