@@ -1,6 +1,6 @@
 """Load, speed, timing and memory of the live service.
 
-    python benchmarks/bus_load.py [--only load|max|offline|timing|memory]… [--seconds 20] [--json]
+    python benchmarks/bus_load.py [--only load|max|offline|timing|memory]… [--seconds 20] [--keep]
 
 load     4,000 frames/s (a saturated 500 kbit/s bus), 200 of them wanted: CPU time of `cangauge run`
          and lost wanted frames, compared with a bare python-can loop on the same bus.
@@ -31,7 +31,6 @@ from typing import Any
 
 import can
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from cangauge._resources import shared_file
@@ -47,6 +46,7 @@ from cangauge.replay.player import Pacer
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder
 from cangauge.types import Sample
+from figures import publish
 from live_service import MODEL, command, service
 
 RATE_HZ = 4000
@@ -68,7 +68,7 @@ def bus() -> BusAddress:
     return bus_address("udp_multicast", options={"port": PORT})
 
 
-def load(seconds: float) -> tuple[Result, list[Row]]:
+def load(seconds: float) -> list[Row]:
     """Measure `cangauge run` and a bare loop on a saturated bus."""
     with service(bus(), until_idle_s=1.5) as process:
         sent = send_load(seconds)
@@ -76,26 +76,20 @@ def load(seconds: float) -> tuple[Result, list[Row]]:
     run = json.loads(out)
     bare = bare_loop(seconds)
     wanted = int(sent["wanted"])
-    result = {
-        "sent": sent,
-        "run": run,
-        "bare": bare,
-        # Waiting 1.5 s for the end costs no CPU time.
-        "run_cores": run["cpu_seconds"] / sent["seconds"],
-        "bare_cores": bare["cpu_seconds"] / sent["seconds"],
-        "wanted_lost": wanted - run["frames"]["received"],
-    }
-    rows = [
+    # Waiting 1.5 s for the end costs no CPU time.
+    run_cores = run["cpu_seconds"] / sent["seconds"]
+    bare_cores = bare["cpu_seconds"] / sent["seconds"]
+    lost = wanted - run["frames"]["received"]
+    return [
         ("frames sent", f"{sent['frames'] / sent['seconds']:.0f}/s over {sent['seconds']:.1f} s",
          f"{RATE_HZ}/s"),
         ("wanted frames", f"{wanted / sent['seconds']:.0f}/s", ""),
-        ("wanted frames lost", f"{result['wanted_lost']} of {wanted}", "0"),
-        ("CPU of `cangauge run`", f"{100 * result['run_cores']:.1f} % of a core", "< 50 %"),
-        ("CPU of a bare python-can loop", f"{100 * result['bare_cores']:.1f} % of a core", ""),
+        ("wanted frames lost", f"{lost} of {wanted}", "0"),
+        ("CPU of `cangauge run`", f"{100 * run_cores:.1f} % of a core", "< 50 %"),
+        ("CPU of a bare python-can loop", f"{100 * bare_cores:.1f} % of a core", ""),
         ("  lost by it", f"{sent['frames'] - bare['frames']} of {sent['frames']}", ""),
-        ("run relative to the bare loop", f"{result['run_cores'] / result['bare_cores']:.2f}×", ""),
+        ("run relative to the bare loop", f"{run_cores / bare_cores:.2f}×", ""),
     ]  # fmt: skip
-    return result, rows
 
 
 def send_load(seconds: float) -> Result:
@@ -155,7 +149,7 @@ def _count_frames(pipe: Any) -> None:
     receiver.shutdown()
 
 
-def full_speed() -> tuple[Result, list[Row]]:
+def full_speed() -> list[Row]:
     """Measure a 2.5 h log through the bus."""
     path = shared_file("replay", "leaf2012_reconstruction_white.parquet")
     with service(bus(), "--time-source", "replay-clock", until_idle_s=1.0) as process:
@@ -168,33 +162,30 @@ def full_speed() -> tuple[Result, list[Row]]:
         out, _ = process.communicate(timeout=60)
     replay, run = json.loads(done.stdout), json.loads(out)
     lost = replay["samples"] - run["samples"]
-    rows = [
+    return [
         ("log", f"{replay['log_seconds'] / 3600:.2f} h, {replay['samples']} samples", ""),
         ("time through the bus", f"{replay['seconds']:.1f} s", "< 60 s"),
         ("samples lost", str(lost), "0"),
         ("CPU of `cangauge run`", f"{run['cpu_seconds']:.1f} s", ""),
         ("step, mean", f"{1e6 * run['step']['mean_s']:.0f} µs", ""),
     ]
-    return {"replay": replay, "run": run, "lost": lost}, rows
 
 
-def offline() -> tuple[Result, list[Row]]:
+def offline() -> list[Row]:
     """Measure the same log offline."""
     began = time.monotonic()
     log = long_log()
     read_s = time.monotonic() - began
     settings = EstimatorSettings(temperature_source=log.temperature_source)
     _, scores = estimate_log(log, Model.load(MODEL), settings)
-    result = {"rows": len(log), "read_seconds": read_s, "seconds": scores.seconds}
-    rows = [
+    return [
         ("log", f"{log.duration_s / 3600:.2f} h, {len(log)} samples", ""),
         ("estimation", f"{scores.seconds:.2f} s", "< 5 s"),
         ("reading", f"{read_s:.2f} s", ""),
     ]
-    return result, rows
 
 
-def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
+def timing(seconds: float = 120.0) -> list[Row]:
     """Measure a capture in real time: 100 frames/s of the battery, 100 others."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "capture.log"
@@ -209,14 +200,13 @@ def timing(seconds: float = 120.0) -> tuple[Result, list[Row]]:
             command(bus(), "replay", path), capture_output=True, text=True, check=True
         )
     replay: Result = json.loads(done.stdout)
-    rows = [
+    return [
         ("capture", f"{replay['log_seconds']:.3f} s, {replay['frames']} frames", ""),
         ("duration of the replay", f"{replay['seconds']:.3f} s", f"{seconds:.1f} ± 0.1 s"),
     ]
-    return replay, rows
 
 
-def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
+def memory(hours: float = 24.0) -> list[Row]:
     """Measure the memory of a process over a day of bus time."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -224,14 +214,13 @@ def memory(hours: float = 24.0) -> tuple[Result, list[Row]]:
     process.start()
     result: Result = ours.recv()
     process.join()
-    rows = [
+    return [
         ("bus time, samples", f"{hours:.0f} h, {result['samples']}", ""),
         ("memory after half an hour", f"{result['mb_first']:.1f} MB", ""),
         ("memory at the end", f"{result['mb_last']:.1f} MB", ""),
         ("growth", f"{result['mb_last'] - result['mb_first']:+.2f} MB", "flat"),
         ("computation", f"{result['seconds']:.0f} s", ""),
     ]
-    return result, rows
 
 
 def _handle_a_day(pipe: Any, hours: float) -> None:
@@ -273,8 +262,8 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=20.0, help="length of the load")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parts: dict[str, Callable[[], tuple[Result, list[Row]]]] = {
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
+    parts: dict[str, Callable[[], list[Row]]] = {
         "load": lambda: load(options.seconds),
         "max": full_speed,
         "offline": offline,
@@ -283,21 +272,12 @@ def main() -> int:
     }
     parser.add_argument("--only", action="append", choices=list(parts), help="repeat for several")
     options = parser.parse_args()
-    results: Result = {"bus": str(bus()), "cores": os.cpu_count()}
-    tables = []
+    table = Table("part", "", "measured", "target")
     for name in options.only or parts:
         sys.stderr.write(f"measuring: {name} …\n")
-        results[name], rows = parts[name]()
-        tables.append((name, rows))
-    if options.json:
-        sys.stdout.write(json.dumps(results) + "\n")
-        return 0
-    console = Console()
-    for name, rows in tables:
-        table = Table("", "measured", "target", title=f"{name} ({bus()}, {os.cpu_count()} cores)")
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
+        for row in parts[name]():
+            table.add_row(name, *row)
+    publish("bus-load", [table], ["src/cangauge/bus", "src/cangauge/service"], keeps=options.keep)
     return 0
 
 

@@ -317,14 +317,26 @@ PARTS: dict[str, Callable[[], Result]] = {
 }  # fmt: skip
 
 
+WORDS = {
+    "": "{} s",
+    "ratio": "{} × its barest form",
+    "us": "{} µs",
+    "bare_us": "barest {} µs",
+    "seconds": "{} s",
+    "peak_mib": "{} MiB",
+}
+"""Field of a result → its words; others stand before their value."""
+
+
 def tables_of(result: Result) -> list[Table]:
     """Return each part as a table of names and values."""
     tables = []
     for part, rows in result.items():
         table = Table(part, "")
         for name, value in rows.items():
-            fields = value.items() if isinstance(value, dict) else [("", value)]
-            table.add_row(str(name), "; ".join(f"{key} {_short(item)}" for key, item in fields))
+            fields = value if isinstance(value, dict) else {"": value}
+            texts = (WORDS.get(key, f"{key}: {{}}").format(_short(x)) for key, x in fields.items())
+            table.add_row(str(name), "; ".join(texts))
         tables.append(table)
     return tables
 
@@ -338,11 +350,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--only", action="append", choices=list(PARTS), help="repeat for several")
+    parser.add_argument("--only", action="append", choices=list(PARTS), help="default: all but fit")
     parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     options = parser.parse_args()
     found = {}
-    for name in options.only or PARTS:
+    for name in options.only or [part for part in PARTS if part != "fit"]:
         sys.stderr.write(f"measuring: {name} …\n")
         found[name] = PARTS[name]()
     name = "-".join(options.only or ["cost"])

@@ -79,7 +79,7 @@ def _content(table: Table) -> dict[str, Any]:
 
 
 def _command(given: Sequence[str]) -> str:
-    """Return a command line as a reader would type it, without the folder of the data."""
+    """Return a command line as a reader would type it, without the places of this machine."""
     module = sys.modules["__main__"].__spec__
     if module is None:
         script = f"python {Path(given[0]).resolve().relative_to(ROOT)}"
@@ -88,9 +88,10 @@ def _command(given: Sequence[str]) -> str:
     else:
         script = f"cd benchmarks && python -m {module.parent}"
     arguments = [each for each in given[1:] if each != "--keep"]
+    places = {"--data": "FOLDER", "--cases": "FOLDER", "--peers": "PYTHON"}
     for place, each in enumerate(arguments[:-1]):
-        if each in {"--data", "--cases"}:
-            arguments[place + 1] = "FOLDER"
+        if each in places:
+            arguments[place + 1] = places[each]
     return " ".join([script, *arguments])
 
 
