@@ -4,8 +4,8 @@
     P(fault | gap) ∝ (mean over its effects of e^u_k)^γ
 
 with n_k/o_k the evidence of effect k over what healthy logs show of it, V_k the mean square error
-that it leaves, v that of a healthy log, and n_max the largest evidence of any effect. Where a fault
-is large, many effects explain much of it, and the first two terms hardly tell them apart. The third
+that it leaves, v that of a healthy log, and n_max the largest evidence of any effect. Many
+effects explain much of a large fault, so the first two terms hardly separate them. The third term
 does: it is the evidence that an effect lacks against the best one.
 
 The faults compete with each other, and together with `none` and `unknown` (nested logit: Train,

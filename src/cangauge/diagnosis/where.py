@@ -19,9 +19,9 @@ AFTER_REST_MIN: Final = (0.0, 10.0, 30.0)
 """Edges of the time since the last long rest [min]; the last interval is open."""
 
 PIECE_S, LEAST_PIECES, DRAWS = 300, 3, 400
-"""Bootstrap: length of the pieces that it draws, beyond the correlation of errors [s]; pieces with
-rows in an interval from which on its error is told apart, as two always agree; and draws, by which
-quantiles vary by one per cent."""
+"""Bootstrap: length of a piece [s], longer than errors are correlated; least number of pieces with
+rows in an interval, since two always agree; and number of draws, which leaves quantiles uncertain
+by one per cent."""
 DIFFERENT: Final = 1.3
 """Smallest ratio of errors that counts as a difference: a third is visible in a plot."""
 

@@ -24,7 +24,7 @@ longer in the receive queue."""
 
 
 class OwnFrames:
-    """Tell own frames that a bus returns from those of another sender with the same ids.
+    """Distinguish the echoes of own frames from frames of another sender with the same ids.
 
     Parameters
     ----------

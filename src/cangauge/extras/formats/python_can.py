@@ -120,10 +120,10 @@ class _InPieces:
 
 
 class _EndingBlf(can.BLFReader):
-    """python-can's reader, with limits to what it unpacks at once and to how it goes on.
+    """python-can's reader with a limit on the size of a container.
 
-    It would unpack a container of any size, and read an object whose size leads to no next one for
-    ever.
+    Without it a small file unpacks to gigabytes, and an object that states a wrong size is read
+    again and again.
     """
 
     objects = 0

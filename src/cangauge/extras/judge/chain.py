@@ -229,7 +229,7 @@ class Chain:
         return found
 
     def drawn_before(self, late_s: float) -> FloatArray:
-        """Return the charge drawn so long before each block, from the start of its stretch [%]."""
+        """Return the charge drawn since the stretch began, `late_s` before each block [%]."""
         late_h = np.minimum(late_s / 3600.0, self.blocks.hours)
         at = self.blocks.clock_h - late_h
         return np.interp(at, self.samples.clock_h, self.samples.drawn_pct)

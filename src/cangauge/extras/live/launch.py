@@ -52,9 +52,9 @@ class Live(Output):
             text=True,
         )
         assert self.process.stdin is not None  # noqa: S101 - as it was made
-        told = config.model_copy(update={"status_socket": str(endpoint)})
+        child_config = config.model_copy(update={"status_socket": str(endpoint)})
         with suppress(BrokenPipeError), self.process.stdin as stdin:
-            stdin.write(told.model_dump_json())
+            stdin.write(child_config.model_dump_json())
 
     def on_snapshot(self, snapshot: Snapshot) -> None:  # noqa: ARG002 - it asks for itself
         """Report once if the child has ended."""
