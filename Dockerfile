@@ -1,8 +1,7 @@
 # docker build -t cangauge . && docker run --rm --network host -v "$PWD:/data" cangauge run --help
-# A tag can be moved: for an image that can be built again, give the base by its digest,
-#   docker build --build-arg BASE=python@sha256:… -t cangauge .
-# `docker buildx imagetools inspect python:3.13-slim` prints it.
-ARG BASE=python:3.13-slim
+# The base by its digest (all platforms), since a tag can be moved. A newer one:
+# `docker buildx imagetools inspect python:3.13-slim` prints its digest; put it here or in --build-arg BASE=….
+ARG BASE=python:3.13.15-slim-trixie@sha256:7c61056e61ac89e852de05f3dc6fa51a6dd2181797bceed46aa725dd7cb2cd3b
 FROM ${BASE} AS build
 WORKDIR /src
 # For the C core; the image that runs has no compiler.

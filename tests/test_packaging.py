@@ -22,3 +22,10 @@ def test_image_copies_what_the_build_needs() -> None:
     ignored = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     assert needed <= copied
     assert needed <= {line.removeprefix("!") for line in ignored if line.startswith("!")}
+
+
+def test_image_pins_its_base_by_digest() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    bases = re.findall(r"^ARG BASE=(.*)$", text, re.MULTILINE)
+    assert [bool(re.search(r"@sha256:[0-9a-f]{64}$", base)) for base in bases] == [True]
+    assert set(re.findall(r"^FROM (\S+)", text, re.MULTILINE)) == {"${BASE}"}

@@ -140,7 +140,7 @@ def test_load_columns_are_the_equation() -> None:
         (-0.06, -0.01, -0.02),
         delays_s=(0.0, 10.0),
         low_pass_s=(140.0,),
-        arrhenius=Arrhenius(0.9, (-0.05, -0.01, -0.02), 15.0),
+        arrhenius=Arrhenius(factor=0.9, resistance_ohm=(-0.05, -0.01, -0.02), mean_c=15.0),
     )
     current, celsius = np.array([[40.0, 30.0, 12.0]]), -5.0
     factor = math.exp(3000.0 * (1.0 / 268.15 - 1.0 / 288.15)) - 1.0

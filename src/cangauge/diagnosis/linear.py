@@ -128,7 +128,11 @@ class Linear:
             delays_s=loads.delays_s,
             low_pass_s=self.low_pass_s,
             resistance_ohm=tuple(now[N + 1 : -1].tolist()),
-            arrhenius=Arrhenius(float(now[-1]), tuple(self.ohm.tolist()), self.mean_c),
+            arrhenius=Arrhenius(
+                factor=float(now[-1]),
+                resistance_ohm=tuple(self.ohm.tolist()),
+                mean_c=self.mean_c,
+            ),
         )
         curve = HermiteCurve.rising(KNOTS_PCT, now[:N])
         corrected = replace(voltage, curve=curve, loads=changed)

@@ -438,7 +438,11 @@ class Model(Fields):
             delays_s=DELAYS_S,
             low_pass_s=LOW_PASS_S,
             resistance_ohm=tuple(ohm),
-            arrhenius=Arrhenius(b, tuple(known.arrhenius_ohm.tolist()), known.mean_c),
+            arrhenius=Arrhenius(
+                factor=b,
+                resistance_ohm=tuple(known.arrhenius_ohm.tolist()),
+                mean_c=known.mean_c,
+            ),
         )
         curve_v = known.coefficients[:n].tolist()
         covariance = known.covariance[:p, :p]

@@ -403,23 +403,15 @@ def past_currents(
     return np.column_stack([delayed, *smooth])
 
 
-@dataclass(frozen=True)
-class Arrhenius:
-    """Change of the resistances with temperature.
-
-    Parameters
-    ----------
-    factor : float
-        b [-]; 1 where all of the resistance follows a(T).
-    resistance_ohm : tuple of float
-        R⁰ of each current [Ω]; negative.
-    mean_c : float
-        Temperature T̄ at which the resistances hold [°C].
-    """
+class Arrhenius(Fields):
+    """Change of the resistances with temperature."""
 
     factor: Value
+    """b [-]; 1 where all of the resistance follows a(T)."""
     resistance_ohm: tuple[Value, ...]
+    """R⁰ of each current [Ω]; negative."""
     mean_c: Celsius
+    """Temperature T̄ at which the resistances hold [°C]."""
 
     @cached_property
     def warm(self) -> float:
