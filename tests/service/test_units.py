@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import subprocess
@@ -11,8 +12,10 @@ import pytest
 
 from cangauge.extras.live.addresses import http_address
 from cangauge.service.config import load_config
+from cangauge.service.setup import address_of
+from cangauge.service.status_client import StatusSocket, find_socket, socket_path
 
-NAME = "cangauge@.service"
+NAME, LIVE = "cangauge@.service", "cangauge-live@.service"
 
 
 @pytest.fixture
@@ -21,9 +24,10 @@ def units(project: Path, tmp_path: Path) -> Path:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze on this machine")
     source = project / "contrib" / "systemd"
-    text = (source / NAME).read_text().replace("/usr/local/bin/cangauge", "/bin/true")
-    (tmp_path / NAME).write_text(text)
-    (tmp_path / "cangauge@can0.service").write_text(text)
+    for name in (NAME, LIVE):
+        text = (source / name).read_text().replace("/usr/local/bin/cangauge", "/bin/true")
+        (tmp_path / name).write_text(text)
+        (tmp_path / name.replace("@", "@can0")).write_text(text)
     (tmp_path / f"{NAME}.d").mkdir()
     shutil.copy(source / "hardening.conf", tmp_path / f"{NAME}.d")
     return tmp_path
@@ -41,10 +45,11 @@ def analyze(units: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_units_are_what_systemd_reads(units: Path) -> None:
-    verified = analyze(units, "verify", str(units / "cangauge@can0.service"))
-    assert verified.returncode == 0, verified.stderr
-    # It only warns of keys that it does not know.
-    assert "cangauge" not in verified.stderr
+    for name in ("cangauge@can0.service", "cangauge-live@can0.service"):
+        verified = analyze(units, "verify", str(units / name))
+        assert verified.returncode == 0, verified.stderr
+        # It only warns of keys that it does not know.
+        assert "cangauge" not in verified.stderr
     broken = units / f"{NAME}.d" / "broken.conf"
     broken.write_text("[Service]\nProtectSystm=strict\n")
     assert "ProtectSystm" in analyze(units, "verify", str(units / "cangauge@can0.service")).stderr
@@ -74,3 +79,20 @@ def test_the_example_configuration_is_one(project: Path) -> None:
     assert config.record == "/var/lib/cangauge/can0/drive.log.gz"
     assert (config.record_part_mb, config.record_keep_mb) == (64, 2000)
     assert http_address(str(config.http), None, {}).host == "127.0.0.1"
+
+
+def test_the_status_socket_of_the_unit_is_found(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (project / "contrib" / "systemd" / NAME).read_text().replace("%i", "can0")
+    folder = re.findall(r"^RuntimeDirectory=(.*)$", text, re.MULTILINE)
+    stated = re.findall(r"/run/(\S*\.sock)", text)
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / folder[0]))
+    config = load_config(project / "contrib" / "systemd" / "example.toml")
+    made = socket_path(str(address_of(config)))
+    assert [str(made.relative_to(tmp_path))] == stated
+    # Another program, such as `cangauge status` or the live unit, has no such variable.
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    monkeypatch.setattr("cangauge.service.status_client.SYSTEM_FOLDER", tmp_path / "cangauge")
+    with contextlib.closing(StatusSocket(made, dict)):
+        assert find_socket(made.name) == made
