@@ -92,8 +92,8 @@ def _wrong_models(model: Model) -> dict[str, Model]:
     loads, curve = model.loads, model.curve
     tripled = [3.0 * ohm for ohm in loads.resistance_ohm]
     three = [3.0 * ohm for ohm in loads.arrhenius.resistance_ohm]
-    scaled = replace(loads.arrhenius, resistance_ohm=tuple(three))
-    flat = replace(loads.arrhenius, factor=0.0)
+    scaled = loads.arrhenius.model_copy(update={"resistance_ohm": tuple(three)})
+    flat = loads.arrhenius.model_copy(update={"factor": 0.0})
     higher = [volts + 8.0 for volts in curve.voltage_v]
     three_times = {
         "loads": loads.model_copy(update={"resistance_ohm": tuple(tripled), "arrhenius": scaled})

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 import typer
 
 from cangauge._extras import require_extra
-from cangauge._files import check_writable, require_suffix
+from cangauge._files import check_writable, require_suffix, written_name
 from cangauge.cli.output import remark
 from cangauge.errors import InputError
 
@@ -358,7 +358,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
     read = {Path(os.path.realpath(path)) for path in inputs}
     written: set[Path] = set()
     for output in filter(None, outputs):
-        place = Path(os.path.realpath(output))
+        place = written_name(output)
         if place in read:
             problem, cure = "this output is also an input", "name another file for it"
             raise InputError(problem, source=output, cure=cure)

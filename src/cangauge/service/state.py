@@ -28,6 +28,7 @@ from cangauge._files import (
     read_bounded,
     remove_parts,
     text_sha256,
+    written_name,
 )
 from cangauge._logging import emit
 from cangauge._text import duration, number
@@ -135,7 +136,7 @@ class StateKeeper:
             emit(_LOG, logging.INFO, "state.none", text)
             return self
         try:
-            if not is_own(self._path.stat()):
+            if not is_own(written_name(self._path).lstat()):  # a link of another user, or his file
                 raise InputError("belongs to another user", source=self._path)  # noqa: TRY301
             content = read_state(self._path)
             age_s = self._age_s(content)

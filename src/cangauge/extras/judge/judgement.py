@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from operator import attrgetter
 from typing import Any, Final
@@ -340,7 +339,7 @@ def narrowed(judgement: Judgement) -> Model:
         changed = {
             "kt_v_per_k": before.kt_v_per_k + float(change[0]),
             "resistance_ohm": tuple((np.array(before.resistance_ohm) + change[1:last]).tolist()),
-            "arrhenius": replace(before.arrhenius, factor=factor),
+            "arrhenius": before.arrhenius.model_copy(update={"factor": factor}),
         }
         update["loads"] = before.model_copy(update=changed)
     return model.model_copy(update=update)
