@@ -15,8 +15,11 @@ import pytest
 
 import cangauge
 from cangauge.__main__ import main
+from cangauge.errors import InputError
+from cangauge.extras.judge.judgement import narrowed
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
+from cangauge.model.published import leaf_2012_model_file
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 Pack = tuple[cangauge.Model, list[cangauge.Log]]
@@ -482,3 +485,9 @@ def peak_bytes(log: cangauge.Log) -> int:
 def test_memory_grows_with_the_rows() -> None:
     peak_bytes(unbroken(days=2))  # what is loaded once
     assert peak_bytes(unbroken(days=40)) < 5.0 * peak_bytes(unbroken(days=10))
+
+
+def test_a_model_without_errors_of_its_curve_cannot_be_narrowed(pack: Pack) -> None:
+    judgement = cangauge.judge(pack[1][:1], leaf_2012_model_file())
+    with pytest.raises(InputError, match="no error of its curve that logs could narrow"):
+        narrowed(judgement)

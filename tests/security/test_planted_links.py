@@ -8,7 +8,9 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import can
 import pytest
+from _pytest.mark import ParameterSet
 
 from cangauge._files import atomic_path, write_text_atomic
 from cangauge.bus.vehicle import Vehicle
@@ -41,30 +43,66 @@ def shared() -> Iterator[Path]:
         yield Path(name)
 
 
-@pytest.fixture
-def drive(tmp_path: Path) -> Path:
-    write_log(short_log(), tmp_path / "drive.csv")
-    return tmp_path / "drive.csv"
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return a drive as a log and as a capture, and a model of it."""
+    folder = tmp_path_factory.mktemp("made")
+    paths = {"DRIVE": folder / "drive.csv", "CAPTURE": folder / "x.log", "MODEL": folder / "m.json"}
+    write_log(short_log(600.0), paths["DRIVE"])
+    with can.CanutilsLogWriter(paths["CAPTURE"]) as log:
+        for frame in frames_of(short_log(), shift_s=1e9):
+            log(frame)
+    assert in_process("fit", paths["DRIVE"], *CAPACITY, "-o", paths["MODEL"]).code == 0
+    return paths
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("log.csv", ("twin", "--seed", 1, "--hours", 0.05, "-o")),
-        ("soc.csv", ("estimate", "DRIVE", "-m", leaf_model_path(), "-o")),
-        ("soc.parquet", ("estimate", "DRIVE", "-m", leaf_model_path(), "-o")),
-        ("page.html", ("inspect", "DRIVE", "--report")),
-    ],
-)
+def slow(*values: object) -> ParameterSet:
+    return pytest.param(*values, marks=pytest.mark.nightly)
+
+
+CAPACITY = ("--capacity-ah", 60)
+WRITERS = [
+    ("twin --seed 1 --hours 0.05 -o OUT/log.csv", "log.csv"),
+    ("estimate DRIVE -m MODEL -o OUT/soc.csv", "soc.csv"),
+    ("estimate DRIVE -m MODEL -o OUT/soc.parquet", "soc.parquet"),
+    ("inspect DRIVE --report OUT/page.html", "page.html"),
+    ("fit DRIVE --capacity-ah 60 -o OUT/m.json --report OUT/m.html", "m.json m.html"),
+    ("gap DRIVE -m MODEL --report OUT/gap.html", "gap.html"),
+    (
+        "judge DRIVE -m MODEL -o OUT/m.json --corrected OUT/c.csv --report OUT/j.html",
+        "m.json c.csv j.html",
+    ),
+    ("init CAPTURE --force -o OUT", "run.toml"),
+    slow("estimate DRIVE -m MODEL -o OUT/soc.csv --report OUT/soc.html", "soc.csv soc.html"),
+    slow("export-fmu -m MODEL -o OUT/x.fmu", "x.fmu"),
+    slow("fleet estimate DRIVE -m MODEL -o OUT/x.parquet", "x.parquet"),
+    slow("fleet gap DRIVE -m MODEL -o OUT/x.parquet", "x.parquet"),
+    slow("fleet judge DRIVE -m MODEL -o OUT/x.parquet", "x.parquet"),
+]
+
+
+@pytest.mark.parametrize(("line", "names"), WRITERS)
 def test_a_command_does_not_write_through_a_planted_link(
-    name: str, arguments: tuple[object, ...], shared: Path, drive: Path
+    line: str, names: str, shared: Path, made: dict[str, Path]
 ) -> None:
     mine = shared / "mine"
     mine.write_text("mine")
-    planted(shared / name, mine)
-    given = [drive if each == "DRIVE" else each for each in arguments]
-    assert in_process(*given, shared / name).code == 0
+    for name in names.split():
+        planted(shared / name, mine)
+    words = [str(made.get(word, word)).replace("OUT", str(shared)) for word in line.split()]
+    ended = in_process(*words)
+    assert ended.code == 0, ended.err
     assert mine.read_text() == "mine"
+    assert not any((shared / name).is_symlink() for name in names.split())
+
+
+def test_sources_in_place_of_a_planted_link_are_refused(shared: Path) -> None:
+    mine = shared / "mine"
+    mine.write_text("mine")
+    planted(shared / "cangauge_model.c", mine)
+    ended = in_process("export-c", "-m", leaf_model_path(), "-o", shared)
+    assert (ended.code, mine.read_text()) == (2, "mine")
+    assert "not from an export" in ended.err
 
 
 def test_a_recording_does_not_begin_in_a_file_of_another_name(shared: Path) -> None:
@@ -232,3 +270,16 @@ def test_a_state_of_another_user_is_not_trusted(shared: Path) -> None:
     ended = in_process(*RUN, "--config", BRIEF, "--state", state)
     assert ended.code == 0
     assert "belongs to another user" in ended.err
+
+
+def test_a_link_of_another_user_to_an_own_state_is_not_trusted(shared: Path) -> None:
+    saved, state = shared / "earlier.json", shared / "cangauge-state.json"
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    with StateKeeper(saved, pipeline, "virtual planted", 86400.0):
+        for frame in frames_of(short_log()):
+            pipeline.handle(frame)
+    planted(state, saved)
+    ended = in_process(*RUN, "--config", BRIEF, "--state", state)
+    assert ended.code == 0
+    assert "belongs to another user" in ended.err
+    assert saved.exists()

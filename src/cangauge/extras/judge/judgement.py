@@ -311,12 +311,18 @@ def _faults(chain: Chain, fits: Sequence[Fitted]) -> list[FoundFault]:
 
 
 def narrowed(judgement: Judgement) -> Model:
-    """Return the model with its curve and loads learned from the logs, and their σ."""
+    """Return the model with its curve and loads learned from the logs, and their σ.
+
+    InputError for a model of the published equation, which states no error of its curve.
+    """
     model, fields, posterior = (
         judgement.model,
         judgement.model.functions,
         judgement.fits[0].posterior,
     )
+    if not fields.curve_v:
+        problem = "the model states no error of its curve that logs could narrow"
+        raise InputError(problem, field="--output", cure="make the model by `cangauge fit`")
     curve, loads = np.array(fields.curve_v).T, np.array(fields.load).T
     number_of = curve.shape[1]
     learned = posterior.mean[:number_of]
