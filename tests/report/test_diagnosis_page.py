@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from cangauge.diagnosis import Diagnosis, Healthy, diagnose, learn_references
@@ -62,6 +63,15 @@ def test_page_says_the_same_as_the_json(found: Diagnosis, page: Page) -> None:
     assert f"{gap['baseline_rmse_v']:.2f}" in text
     assert f"{gap['healthy_rmse_v']:.2f}" in text
     assert len(text) < MAX_PAGE_BYTES
+
+
+def test_a_log_with_absolute_times_is_drawn_within_its_axis(model: Model, known: Healthy) -> None:
+    log = day(21)
+    moved = replace(log, time_s=log.time_s + 1.7e9, voltage_v=log.voltage_v + 8.0)
+    page = gap_page(diagnose([moved], model, known))
+    (error,) = [each for each in page.figures if each.title == "Measured minus modelled voltage"]
+    for line in error.plot.renderers:
+        assert np.nanmin(line.data_source.data["x"]) >= 0.0
 
 
 def test_a_healthy_log_has_a_page_too(model: Model, known: Healthy) -> None:

@@ -259,7 +259,7 @@ def test_page_escapes_what_it_shows() -> None:
 
 
 def test_columns_of_numbers_are_flush_right() -> None:
-    table = Table.of([{"name": "a", "value": "−1.5"}, {"name": "b", "value": "–"}])
+    table = Table(["name", "value"], [["a", "−1.5"], ["b", "–"]])
     html = Page("t", "", "", [], {"s": [table]}).html()
     assert '<th scope="col">name</th><th class="number" scope="col">value</th>' in html
     assert '<td>a</td><td class="number">−1.5</td>' in html

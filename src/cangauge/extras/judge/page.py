@@ -10,7 +10,7 @@ from cangauge._text import counted, number
 from cangauge.extras.judge.faults import FAULTS
 from cangauge.extras.judge.result import Judgement
 from cangauge.extras.judge.text import moment, signed
-from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
+from cangauge.extras.report.charts import ORANGE, Figure, TimeFigures
 from cangauge.extras.report.page import Page, Table, Tile, joined
 
 
@@ -79,21 +79,19 @@ def _figure(judgement: Judgement) -> Figure:
     time = TimeFigures([log.time_s for log in logs])
     pieces = list(zip(logs, judgement.corrected_pct, judgement.corrected_std_pct, strict=True))
     published = zip((log.time_s for log in logs), judgement.published_pct, strict=True)
+    bands = [
+        (log.time_s, np.clip(soc - 2.0 * std, 0.0, 100.0), np.clip(soc + 2.0 * std, 0.0, 100.0))
+        for log, soc, std in pieces
+    ]
     figure = time.figure(
         "Published and corrected state of charge",
         "state of charge [%]",
         "The published SoC should lie inside the band (2σ). A dashed line marks a jump of the"
         " gauge, or where it began to stand still.",
+        {"corrected": [(log.time_s, soc) for log, soc, _ in pieces], "published": list(published)},
+        band=bands,
         height=400,
     )
-    bands = [
-        (log.time_s, np.clip(soc - 2.0 * std, 0.0, 100.0), np.clip(soc + 2.0 * std, 0.0, 100.0))
-        for log, soc, std in pieces
-    ]
-    time.band(figure, bands)
-    corrected = [(log.time_s, soc) for log, soc, _ in pieces]
-    time.line(figure, "corrected", corrected, BLUE, line_width=2.0)
-    time.line(figure, "published", list(published), BLACK, line_width=2.0)
     for (number_of, time_s), *_ in judgement.pieces[1:]:
         at = float(time.at(number_of, np.array([time_s]))[0])
         figure.mark("height", at, ORANGE, line_dash="dashed", line_width=2)

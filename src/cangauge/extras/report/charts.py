@@ -6,7 +6,7 @@ time axis. Long series are reduced to the extremes of buckets, so that no peak i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +15,7 @@ from bokeh.layouts import column
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from cangauge._text import number, significant
+from cangauge._text import number
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.settings import GAP_S
@@ -29,10 +29,48 @@ Pieces = Sequence[tuple[FloatArray, ...]]
 BLACK, BLUE, ORANGE, GREEN = "#222222", "#0072b2", "#d55e00", "#009e73"
 PURPLE, SKY, AMBER, GREY = "#a4508b", "#56b4e9", "#e69f00", "#8a94a0"
 
+COLORS: Final[Mapping[str, str]] = {
+    "measured": BLACK,
+    "voltage": BLACK,
+    "reference": BLACK,
+    "counted": BLACK,
+    "published": BLACK,
+    "model": ORANGE,
+    "model as given": ORANGE,
+    "held out": ORANGE,
+    "by Newton": ORANGE,
+    "temperature": ORANGE,
+    "pseudo-OCV": BLUE,
+    "estimate": BLUE,
+    "corrected": BLUE,
+    "corrected model": BLUE,
+    "fit": BLUE,
+    "σ": BLUE,
+    "current": BLUE,
+    "Newton": AMBER,
+    "Coulomb": GREEN,
+    "state of charge": GREEN,
+    "residual": PURPLE,
+}
+"""Quantity over time → color of its line."""
+CHANNELS: Final = {
+    "current": ("current_a", "A"),
+    "voltage": ("voltage_v", "V"),
+    "temperature": ("temperature_c", "°C"),
+    "state of charge": ("soc_pct", "%"),
+}
+"""Channel of a log → its attribute and unit."""
+_SMOOTH: Final = {"reference", "counted", "published", "pseudo-OCV", "estimate", "corrected"}
+"""Lines that noise does not thicken: drawn wide."""
+_STYLES: Final[Mapping[str, Mapping[str, Any]]] = {
+    "Coulomb": {"line_dash": "dashed"},
+    "Newton": {"visible": False},
+    "held out": {"visible": False},
+}
+"""Noisy lines are hidden until their legend entry is clicked."""
+
 MAX_POINTS: Final = 4000
 """Points of a drawn line: no screen resolves more."""
-_LOG_SPACING: Final = 0.004
-"""Free space between two logs on the time axis, relative to its length."""
 
 
 class Figure:
@@ -94,40 +132,31 @@ class Figure:
             toolbar_location="right",
             min_border_left=78,  # aligns time axes below one another
         )
+        legend = models.Legend(orientation="horizontal", click_policy="hide")
+        self.plot.add_layout(legend, "above")
         self.plot.toolbar.logo = None
         self.plot.toolbar.autohide = True
 
-    def line(
-        self,
-        name: str,
-        x: FloatArray,
-        y: FloatArray,
-        color: str,
-        *,
-        in_legend: bool = True,
-        **style: Any,
-    ) -> None:
+    def line(self, name: str, x: FloatArray, y: FloatArray, color: str, **style: Any) -> None:
         """Draw a line through all points; `style` is bokeh's, such as `line_width`."""
         style = {"line_width": 1.3} | style
-        data = _source(x=x, y=y)
-        line = self.plot.line(x="x", y="y", source=data, name=name, line_color=color, **style)
-        if in_legend:
-            self.add_to_legend(name, line)
+        self.draw("line", name, {"x": x, "y": y}, line_color=color, **style)
 
-    def cloud(self, name: str, x: FloatArray, y: FloatArray, color: str) -> None:
-        """Draw points, evenly sampled if there are many."""
+    def cloud(self, name: str, x: FloatArray, y: FloatArray) -> None:
+        """Draw grey points, evenly sampled if there are many."""
         step = max(1, -(-x.size // MAX_POINTS))
-        cloud = self.plot.scatter(
-            x="x",
-            y="y",
-            source=_source(x=x[::step], y=y[::step]),
-            size=3,
-            fill_color=color,
-            fill_alpha=0.35,
-            line_color=None,
-            name=name,
-        )
-        self.add_to_legend(name, cloud)
+        points = {"x": x[::step], "y": y[::step]}
+        style = {"size": 3, "fill_color": GREY, "fill_alpha": 0.35, "line_color": None}
+        self.draw("scatter", name, points, **style)
+
+    def draw(self, glyph: str, name: str, columns: Mapping[str, FloatArray], **style: Any) -> None:
+        """Draw a glyph of bokeh, with an entry in the legend unless the figure shows only it."""
+        # Single precision halves the page: it resolves 0.03 mV at 400 V and 1 ms in 4 h.
+        data = {key: values.astype(np.float32) for key, values in columns.items()}
+        places = {key: key for key in columns}
+        method = getattr(self.plot, glyph)
+        method(**places, source=data, name=name, legend_label=name, **style)
+        self.plot.legend.visible = len(self.plot.renderers) > 1
 
     def mark(self, dimension: str, at: float, color: str = "#66707d", **style: Any) -> None:
         """Draw a line across the figure: at zero error, or at a moment."""
@@ -148,58 +177,10 @@ class Figure:
                 models.BoxAnnotation(left=left, right=right, fill_color="#9aa4b0", fill_alpha=0.16)
             )
 
-    def add_to_legend(self, name: str, drawn: Any) -> None:
-        """Add an entry to the legend, which a figure of one line does not show."""
-        if not self.plot.legend:
-            legend = models.Legend(orientation="horizontal", click_policy="hide", items=[])
-            self.plot.add_layout(legend, "above")
-        legend = self.plot.legend[0]
-        legend.items = [*legend.items, models.LegendItem(label=name, renderers=[drawn])]
-        legend.visible = len(self.plot.renderers) > 1
-
 
 def stacked(*figures: Figure) -> Plot:
     """Return the figures below one another, without titles, for a notebook."""
     return column([figure.plot for figure in figures], sizing_mode="stretch_width")
-
-
-def _source(**columns: FloatArray) -> models.ColumnDataSource:
-    # Single precision halves the page: it resolves 0.03 mV at 400 V and 1 ms in 4 h.
-    return models.ColumnDataSource(
-        {name: values.astype(np.float32) for name, values in columns.items()}
-    )
-
-
-def histogram(
-    title: str, label: str, unit: str, parts: Sequence[tuple[str, FloatArray, str]], caption: str
-) -> Figure:
-    """Return histograms of several series (name, values, color), each in % of its rows.
-
-    NaN is left out.
-    """
-    known = [(name, values[np.isfinite(values)], color) for name, values, color in parts]
-    everything = np.abs(np.concatenate([values for _, values, _ in known]))
-    # The outermost bars include outliers, which would otherwise compress the rest into one bar.
-    limit = (float(np.quantile(everything, 0.999)) if everything.size else 0.0) or 1.0
-    edges = np.linspace(-limit, limit, 61)
-    hover = f"$name: @y{{0.[00]}} %<br>at @x{{0.[000]}} {unit}"
-    shares = Figure(title, f"{label} [{unit}]", "share of rows [%]", caption, hover=hover)
-    for name, values, color in known:
-        counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
-        drawn = shares.plot.vbar(
-            x="x",
-            top="y",
-            width=float(edges[1] - edges[0]),
-            source=_source(
-                x=0.5 * (edges[1:] + edges[:-1]), y=100.0 * counts / max(values.size, 1)
-            ),
-            fill_color=color,
-            fill_alpha=0.4,
-            line_color=None,
-            name=name,
-        )
-        shares.add_to_legend(name, drawn)
-    return shares
 
 
 def bars(
@@ -209,17 +190,10 @@ def bars(
     caption: str,
     *,
     unit: str = "",
-    decimals: int | None = 2,
 ) -> Figure:
-    """Return horizontal bars (name, value, color), each with its value beside it.
-
-    With `decimals` None a value has three significant digits.
-    """
+    """Return horizontal bars (name, value, color), each with its value beside it."""
     names, values, colors = (list(column) for column in zip(*entries, strict=True))
-    texts = [
-        significant(value, 3, unit) if decimals is None else number(value, decimals, unit)
-        for value in values
-    ]
+    texts = [f" {number(value, 2, unit)}" for value in values]
     low, high = min(0.0, *values), max(0.0, *values)
     shown = Figure(
         title,
@@ -232,8 +206,8 @@ def bars(
         x_range=models.Range1d(1.05 * low, high + 0.3 * (high - low) or 1.0),
         y_categories=names[::-1],
     )
-    columns = {"name": names, "value": np.array(values), "color": colors}
-    source = models.ColumnDataSource(columns | {"text": [f" {text}" for text in texts]})
+    columns = {"name": names, "value": np.array(values), "color": colors, "text": texts}
+    source = models.ColumnDataSource(columns)
     shown.plot.hbar(y="name", right="value", height=0.6, color="color", source=source)
     shown.plot.text(
         x="value",
@@ -269,7 +243,7 @@ class TimeFigures:
 
     def __init__(self, times_s: Sequence[FloatArray], names: Sequence[str] = ()) -> None:
         durations_s = np.array([float(time_s[-1] - time_s[0]) for time_s in times_s])
-        spacing_s = _LOG_SPACING * float(durations_s.sum())
+        spacing_s = 0.004 * float(durations_s.sum())  # free space between two logs
         ends_s = np.cumsum(durations_s + spacing_s)
         total_s = max(float(ends_s[-1]) - spacing_s, 1e-3)  # a single row needs an axis too
         units = ((300.0, 1.0, "s"), (6.0 * 3600.0, 60.0, "min"), (np.inf, 3600.0, "h"))
@@ -292,9 +266,26 @@ class TimeFigures:
         return np.asarray(self.start[number] + (time_s - self._first_s[number]) / self._unit_s)
 
     def figure(
-        self, title: str, y_label: str, caption: str, *, height: int = 235, names: bool = False
+        self,
+        title: str,
+        y_label: str,
+        caption: str,
+        lines: Mapping[str, Pieces],
+        *,
+        band: Pieces = (),
+        height: int = 235,
     ) -> Figure:
-        """Return an empty figure over time, with the logs' names if `names`; see `Figure`."""
+        """Return a figure over time.
+
+        Parameters
+        ----------
+        title, y_label, caption, height
+            See `Figure`.
+        lines : mapping of str to Pieces
+            A line for each name in `COLORS`.
+        band : Pieces
+            (time_s, low, high) of each log, shaded as ±2σ.
+        """
         unit = y_label.rpartition("[")[2].rstrip("]")
         hover = f"$name: @y{{0.[000]}} {unit}<br>at @x{{0.[00]}} {self.unit}"
         shown = Figure(
@@ -302,27 +293,31 @@ class TimeFigures:
         )
         for boundary in self._boundaries:
             shown.mark("height", boundary, "#c3cad3")
-        if names and self.start.size > 1:
-            for start, name in zip(self.start, self._names, strict=True):
+        if self.start.size > 1:
+            for start, name in zip(self.start, self._names, strict=False):
                 text = name.replace("$", "")[:22]  # $…$ would be TeX
                 label = models.Label(x=float(start), y=6, y_units="screen", x_offset=12, text=text)
                 label.update(angle=1.5708, text_font_size="10px", text_color="#55606e")
                 shown.plot.add_layout(label)
+        if band:
+            x, low, high = self.joined(band)
+            rows = np.union1d(extremes(low, MAX_POINTS // 2), extremes(high, MAX_POINTS // 2))
+            columns = {"x": x[rows], "y1": low[rows], "y2": high[rows]}
+            shown.draw("varea", "±2σ", columns, fill_color=BLUE, fill_alpha=0.18)
+        for name, pieces in lines.items():
+            x, y = self.joined(pieces)
+            rows = extremes(y)
+            width, style = 2.0 if name in _SMOOTH else 1.0, _STYLES.get(name, {})
+            at, values, color = x[rows], y[rows], COLORS[name]
+            shown.line(name, at, values, color, line_width=width, line_alpha=0.85, **style)
         return shown
 
-    def channel(
-        self,
-        name: str,
-        unit: str,
-        pieces: Pieces,
-        color: str,
-        caption: str,
-        *,
-        names: bool = False,
-    ) -> Figure:
-        """Return the figure of one quantity through all logs, named by it; see `figure`."""
-        shown = self.figure(name.capitalize(), f"{name} [{unit}]", caption, names=names)
-        return self.line(shown, name, pieces, color, line_width=1.0)
+    def channel(self, logs: Sequence[Any], name: str, caption: str, *, height: int = 235) -> Figure:
+        """Return the figure of a channel of `CHANNELS` through all logs."""
+        attribute, unit = CHANNELS[name]
+        pieces = [(log.time_s, getattr(log, attribute)) for log in logs]
+        title, y_label = name.capitalize(), f"{name} [{unit}]"
+        return self.figure(title, y_label, caption, {name: pieces}, height=height)
 
     def joined(self, pieces: Pieces) -> tuple[FloatArray, ...]:
         """Return positions and values of one line through all logs, NaN at gaps and between logs.
@@ -337,28 +332,6 @@ class TimeFigures:
             broken = [np.insert(of, breaks, np.nan) for of in values]
             lines.append([np.insert(at, breaks, at[breaks - 1]), *broken])
         return tuple(np.concatenate(parts) for parts in zip(*lines, strict=True))
-
-    def line(self, shown: Figure, name: str, pieces: Pieces, color: str, **style: Any) -> Figure:
-        """Draw one line through all logs into a figure and return it; see `joined` and `Figure`."""
-        x, y = self.joined(pieces)
-        rows = extremes(y)
-        shown.line(name, x[rows], y[rows], color, **style)
-        return shown
-
-    def band(self, shown: Figure, pieces: Pieces) -> None:
-        """Shade ±2σ: `pieces` holds (time_s, low, high) of each log."""
-        x, low, high = self.joined(pieces)
-        rows = np.union1d(extremes(low, MAX_POINTS // 2), extremes(high, MAX_POINTS // 2))
-        area = shown.plot.varea(
-            x="x",
-            y1="low",
-            y2="high",
-            source=_source(x=x[rows], low=low[rows], high=high[rows]),
-            fill_color=BLUE,
-            fill_alpha=0.18,
-            name="±2σ",
-        )
-        shown.add_to_legend("±2σ", area)
 
 
 def extremes(values: FloatArray, max_points: int = MAX_POINTS) -> NDArray[np.intp]:

@@ -7,8 +7,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from cangauge._files import file_sha256
-from cangauge._text import NONE_KNOWN, number, span
+from cangauge._text import number, span
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.faults import FAULT
 from cangauge.diagnosis.text import fault_rows, percent, plan_text
@@ -23,7 +22,7 @@ from cangauge.extras.report.charts import (
     TimeFigures,
     bars,
 )
-from cangauge.extras.report.page import Block, Page, Table, Tile, joined
+from cangauge.extras.report.page import Page
 
 _AXES: Final = {
     "soc": "state of charge",
@@ -43,28 +42,18 @@ def gap_page(found: Diagnosis, model_path: Path | None = None) -> Page:
     model_path : Path, optional
         The model's file, to name it by its SHA-256.
     """
-    places = _places(found.where)
-    first = places.pop(_widest(found.where)) if places else None
-    answer, *details = found.summary.splitlines()
-    names = joined([log.name for log in found.logs])
-    shown: list[Block] = [[_shrinks(found)] if first is None else [first, _shrinks(found)]]
-    return Page(
-        title=f"Diagnosis of {names} with model {found.model.name}",
-        lead=answer,
-        subtitle=" ".join(details),
-        tiles=_tiles(found),
-        sections={"Where and how far": shown},
-        folded={
-            "Every fault: probability and size": [Table(*fault_rows(found), plan_text(found))],
-            "Where else the error lies": [list(places.values())],
-            "Error over time": _over_time(found),
-            "Logs and references": [_compared(found)],
-            "What limits this answer": [found.caveats],
-        },
-        model=found.model,
-        model_path=model_path,
-        logs=found.logs,
-    )
+    values = {
+        "found": found,
+        "path": model_path,
+        "places": _places(found.where),
+        "shrinks": _shrinks(found),
+        "over_time": _over_time(found),
+        "fault_rows": fault_rows(found),
+        "plan": plan_text(found),
+        "words": FAULT,
+        "percent": percent,
+    }
+    return Page.of("diagnosis.j2", values)
 
 
 def diagnosis_figure(found: Diagnosis) -> Plot:
@@ -76,21 +65,6 @@ def diagnosis_figure(found: Diagnosis) -> Plot:
     ]
     entries += [("no fault", answer.none, GREEN), ("none of these", answer.unknown, GREY)]
     return bars("", "probability", entries, "").plot
-
-
-def _tiles(found: Diagnosis) -> list[Tile]:
-    answer = found.posterior
-    verdict = {"gap": "found", "likely": "likely", "none": "not significant"}[answer.level]
-    tiles = [Tile("Gap", verdict, f"P(no fault) {percent(answer.none)}")]
-    if answer.stated:
-        each_p = " or ".join(percent(answer.faults[fault]) for fault in answer.stated)
-        p = f"probability {each_p}"
-        tiles.append(Tile("Fault", " or ".join(FAULT[each].title for each in answer.stated), p))
-    return [
-        *tiles,
-        Tile("Model's error", number(found.baseline_rmse_v, 2, "V"), "RMS, these logs"),
-        Tile("Error of healthy logs", number(found.healthy_rmse_v, 2, "V"), "RMS, left out"),
-    ]
 
 
 def _shrinks(found: Diagnosis) -> Figure:
@@ -113,14 +87,8 @@ def _shrinks(found: Diagnosis) -> Figure:
     return bars(title, "RMS error", entries, caption, unit="V")
 
 
-def _widest(where: Sequence[Mapping[str, Any]]) -> str:
-    """Return the axis with the largest excess that is certain."""
-    excesses = [place["ci"][0] for place in where]
-    return str(where[excesses.index(max(excesses))]["axis"])
-
-
-def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """Return the error of the model along each axis."""
+def _places(where: Sequence[Mapping[str, Any]]) -> list[Figure]:
+    """Return the error of the model along each axis, that with the surest excess first."""
     figures = {}
     for axis in dict.fromkeys(place["axis"] for place in where):
         shown = [place for place in where if place["axis"] == axis]
@@ -130,9 +98,11 @@ def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
         if stands_out(largest):
             times = number(largest["excess"], 1)
             caption = f"At {_interval(largest)} it is {times} times that of all rows."
-        title = f"Where: {_AXES.get(axis, axis)}"
+        title = f"Where: {_AXES[axis]}"
         figures[axis] = bars(title, "RMS error of the model", entries, caption, unit="V")
-    return figures
+    surest = sorted(where, key=lambda place: place["ci"][0], reverse=True)
+    first = [figures.pop(place["axis"]) for place in surest[:1]]
+    return [*first, *figures.values()]
 
 
 def _interval(place: Mapping[str, Any]) -> str:
@@ -142,36 +112,21 @@ def _interval(place: Mapping[str, Any]) -> str:
     return span(low, high, 0, place["unit"])
 
 
-def _compared(found: Diagnosis) -> Table:
-    both = (("log", found.logs), ("reference", found.references))
-    entries = [
-        {
-            "": role,
-            "name": log.name,
-            "duration [min]": number(log.duration_s / 60.0, 0),
-            "temperature [°C]": span(log.temperature_c.min(), log.temperature_c.max(), 0),
-            "SHA-256": (file_sha256(log.source) or NONE_KNOWN)[:12],
-        }
-        for role, logs in both
-        for log in logs
-    ]
-    return Table.of(entries)
-
-
-def _over_time(found: Diagnosis) -> list[Block]:
+def _over_time(found: Diagnosis) -> list[Figure]:
     """Return the figures of the errors, before and after, and of the current."""
-    errors, logs = found.log_errors, found.logs
-    time = TimeFigures([log.time_s for log in logs], [log.name for log in logs])
-    title, caption = "Measured minus modelled voltage", "At 1 Hz, as the model is identified."
-    error = time.figure(title, "measured − model [V]", caption, height=260, names=True)
-    for name, color, values in (
-        ("model as given", ORANGE, [log.before_v for log in errors]),
-        ("corrected", BLUE, [log.after_v for log in errors]),
-    ):
-        pieces = list(zip((log.time_s for log in errors), values, strict=True))
-        time.line(error, name, pieces, color, line_width=1.0, line_alpha=0.85)
+    errors = found.log_errors
+    axis = [log.time_s - log.time_s[0] for log in found.logs]
+    time = TimeFigures(axis, [log.name for log in errors])
+    error = time.figure(
+        "Measured minus modelled voltage",
+        "measured − model [V]",
+        "At 1 Hz, as the model is identified.",
+        {
+            "model as given": [(log.time_s, log.before_v) for log in errors],
+            "corrected model": [(log.time_s, log.after_v) for log in errors],
+        },
+        height=260,
+    )
     error.mark("width", 0.0)
     caption = "Positive current discharges the pack."
-    current = time.figure("Current", "current [A]", caption, height=160)
-    pieces = [(log.time_s, log.current_a) for log in errors]
-    return [error, time.line(current, "current", pieces, GREY, line_width=1.0)]
+    return [error, time.channel(errors, "current", caption, height=160)]

@@ -4,66 +4,46 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from operator import attrgetter
-from typing import Final
 
 import numpy as np
 
-from cangauge._text import NONE_KNOWN, duration, number, significant, span
+from cangauge._text import NONE_KNOWN, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.extras.report.charts import (
-    BLACK,
     BLUE,
-    GREY,
+    COLORS,
     ORANGE,
     Figure,
     Plot,
     TimeFigures,
-    histogram,
     stacked,
 )
-from cangauge.extras.report.page import Block, Page, Table, Tile, joined, range_rows
+from cangauge.extras.report.page import Page
 from cangauge.identify.identification import Identification
 from cangauge.identify.rows import running_rows
-from cangauge.model.effects.library import LIBRARY
-from cangauge.model.model_file import Model, Published
 from cangauge.model.voltage_model import VoltageModel
-
-OWN_NOISE: Final = 2.0
-"""Standard errors within which a coefficient may as well be zero [-]: 95 %."""
-_UNITS: Final = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
-_REMOVED_BY: Final = {
-    "decimation": "not on the model's rate",
-    "start_up_or_shut_down": "at start-up or shut-down",
-    "delay_line_filling": "delay line not yet full",
-}
 
 
 def fit_page(result: Identification) -> Page:
     """Return the page of an identification."""
-    logs, model, fits = result.logs, result.model, result.fits
     time = _time(result)
-    slope = _slope_figure(result.voltage_model)
-    rows = sum(len(item.rows) for item in fits)
-    return Page(
-        title=f"Voltage model {model.name}",
-        lead=result.verdict,
-        subtitle=f"Identified from {joined([log.name for log in logs])}:"
-        f" {duration(sum(log.duration_s for log in logs))}, {rows:,} rows used.",
-        tiles=_tiles(result),
-        sections={
-            "Fit and pseudo-OCV": [_voltage_figure(result, time), [_ocv_figure(result), slope]],
-            "Voltage error": [*_error_figures(result, time), _error_table(result)],
-            "State of charge from voltage": [_newton_figure(result, time)],
-            "Resistance and energy": [_resistance_figure(result), _energy(result)],
-            "Coefficients": _coefficients(model, result.published.condition_number),
-            "Effects": _effects(result),
-            "Recorded data": _recorded_figures(result, time),
-            "How the model was made": _method(result),
-        },
-        model=model,
-        logs=logs,
-    )
+    values = {
+        "result": result,
+        "voltage": _voltage_figure(result, time),
+        "ocv": _ocv_figure(result),
+        "slope": _slope_figure(result.voltage_model),
+        "errors": _error_figures(result, time),
+        "newton": _newton_figure(result, time),
+        "resistance": _resistance_figure(result),
+        "recorded": _recorded_figures(result, time),
+        "held_out_mae_pct": _held_out_mae_pct(result),
+        "removed": sum((Counter(item.rows.removed) for item in result.fits), Counter()),
+        "remarks": _remarks(result),
+        "with_error": _with_error,
+    }
+    return Page.of("fit.j2", values)
 
 
 def fit_figure(result: Identification) -> Plot:
@@ -75,28 +55,6 @@ def _time(result: Identification) -> TimeFigures:
     return TimeFigures([log.time_s for log in result.logs], [log.name for log in result.logs])
 
 
-def _tiles(result: Identification) -> list[Tile]:
-    noise, energy = result.model.noise, result.energy
-    mae, rmse = "not measured", "too few logs to leave one out"
-    if result.is_held_out:
-        mae = number(noise.voltage_mae_pct, 3, "%")
-        rmse = f"RMSE {significant(noise.voltage_rmse_v, 3, 'V')}"
-    expected = f"expected {significant(result.slope_expected_ohm, 3, 'Ω')}"
-    net = f"net {significant(energy.net_kwh, 3, 'kWh')}"
-    of_fit = f"RMSE {significant(result.voltage_rmse_v, 3, 'V')}"
-    return [
-        Tile("Voltage error (MAE)", number(result.voltage_mae_pct, 3, "%"), of_fit),
-        Tile("Held out (MAE)", mae, rmse),
-        Tile("SoC by Newton (MAE)", number(result.soc_newton_mae_pct, 2, "%"), "against counting"),
-        Tile("Slope resistance", significant(result.slope_ohm, 3, "Ω"), expected),
-        Tile("Capacity", number(result.model.capacity_ah, 2, "Ah"), "100 → 0 %"),
-        Tile("Efficiency", number(energy.efficiency_pct, 1, "%"), net),
-    ]
-
-
-# --- Figures
-
-
 def _over_time(result: Identification, name: str) -> list[tuple[FloatArray, FloatArray]]:
     """Return time and an attribute of each log's fit."""
     values = attrgetter(name)
@@ -104,20 +62,18 @@ def _over_time(result: Identification, name: str) -> list[tuple[FloatArray, Floa
 
 
 def _voltage_figure(result: Identification, time: TimeFigures) -> Figure:
-    figure = time.figure(
+    return time.figure(
         "Measured voltage, model and pseudo-OCV",
         "voltage [V]",
         "The model should lie on the measurement. The pseudo-OCV is its part without current."
         " Rows that the fit did not use leave gaps.",
+        {
+            "measured": _over_time(result, "rows.voltage_v"),
+            "model": _over_time(result, "voltage_model_v"),
+            "pseudo-OCV": _over_time(result, "pseudo_ocv_v"),
+        },
         height=320,
-        names=True,
     )
-    measured = _over_time(result, "rows.voltage_v")
-    model = _over_time(result, "voltage_model_v")
-    curve = _over_time(result, "pseudo_ocv_v")
-    time.line(figure, "measured", measured, BLACK, line_width=1.2)
-    time.line(figure, "model", model, ORANGE, line_width=1.0, line_alpha=0.85)
-    return time.line(figure, "pseudo-OCV", curve, BLUE, line_width=1.8)
 
 
 def _ocv_figure(result: Identification) -> Figure:
@@ -136,7 +92,7 @@ def _ocv_figure(result: Identification) -> Figure:
     )
     soc = np.concatenate([item.rows.soc_pct for item in result.fits])
     residual = np.concatenate([item.residual_v for item in result.fits])
-    figure.cloud("measured, less drop", soc, residual + model.pseudo_ocv(soc), GREY)
+    figure.cloud("measured, less drop", soc, residual + model.pseudo_ocv(soc))
     grid = np.linspace(min(0.0, soc.min()), max(100.0, soc.max()), 401)
     figure.line("pseudo-OCV", grid, model.pseudo_ocv(grid), BLUE, line_width=2.2)
     figure.shade_outside(*model.range.soc_pct)
@@ -165,80 +121,64 @@ def _slope_figure(model: VoltageModel) -> Figure:
 
 def _error_figures(result: Identification, time: TimeFigures) -> list[Figure]:
     """Return the error over time and its histogram, of the fit and on rows held out of it."""
-    fitted = _over_time(result, "residual_v")
-    parts = [("fit", np.concatenate([values for _, values in fitted]), BLUE)]
+    lines = {"fit": _over_time(result, "residual_v")}
     held_out = [
         (item.rows.time_s, values)
         for item, values in zip(result.fits, result.held_out_error_v, strict=False)
     ]
     hidden = expected = ""
     if any(np.isfinite(values).any() for _, values in held_out):
-        parts.append(("held out", np.concatenate([values for _, values in held_out]), ORANGE))
+        lines["held out"] = held_out
         hidden = " “Held out” (click the legend) is the error on rows that the fit did not see:"
         hidden += f" {result.model.noise.judged_on}."
         expected = "Expect “held out” on a new log. Where it is much wider than “fit”, the model"
         expected += " overfits its logs. "
-    title = "Measured minus modelled voltage"
-    caption = f"A good fit scatters about zero without lasting bias.{hidden}"
-    error = time.figure(title, "voltage error [V]", caption, height=260, names=True)
-    time.line(error, "fit", fitted, BLUE, line_width=1.0)
-    if hidden:
-        style = {"line_width": 1.0, "line_alpha": 0.75, "visible": False}
-        time.line(error, "held out", held_out, ORANGE, **style)
-    error.mark("width", 0.0)
-    caption = f"{expected}The outermost bars include everything beyond."
-    return [error, histogram("Distribution of the error", "measured − model", "V", parts, caption)]
-
-
-def _error_table(result: Identification) -> Table:
-    noise = result.model.noise
-    rows = [
-        ["MAE of the fit", number(result.voltage_mae_pct), "%", "of the voltage"],
-        ["RMSE of the fit", significant(result.voltage_rmse_v, 3), "V", ""],
-        ["MAE of the error model", number(noise.voltage_mae_pct), "%", noise.judged_on],
-        ["RMSE of the error model", significant(noise.voltage_rmse_v, 3), "V", noise.judged_on],
-        ["of a 30 s mean (σ)", significant(noise.fast_std_v, 3), "V", "new in each block"],
-        [
-            "slow part (σ)",
-            significant(noise.slow_std_v, 3),
-            "V",
-            f"correlated over {number(noise.slow_time_s, 0, 's')}",
-        ],
-        [
-            "level (σ)",
-            significant(noise.level_std_v, 3),
-            "V",
-            "constant over a log: does not average out",
-        ],
-        [
-            "SoC against voltage (σ)",
-            number(noise.soc_std_pct, 1),
-            "%",
-            "times the slope of the curve, a further error of the voltage",
-        ],
-    ]
-    return Table(
-        ["voltage error", "value", "unit", "meaning"],
-        rows,
-        "The filter takes its measurement noise from the last four. Level and coefficients are"
-        f" scaled by the errors of left-out logs (κ² = {number(noise.left_out_scale, 2)}).",
+    error = time.figure(
+        "Measured minus modelled voltage",
+        "voltage error [V]",
+        f"A good fit scatters about zero without lasting bias.{hidden}",
+        lines,
+        height=260,
     )
+    error.mark("width", 0.0)
+    errors = [np.concatenate([values for _, values in pieces]) for pieces in lines.values()]
+    return [error, _histogram(dict(zip(lines, errors, strict=True)), expected)]
+
+
+def _histogram(errors_v: dict[str, FloatArray], expected: str) -> Figure:
+    """Return the distribution of errors [V], each in % of its rows; NaN is left out."""
+    known = {name: values[np.isfinite(values)] for name, values in errors_v.items()}
+    # The outermost bars include outliers, which would otherwise compress the rest into one bar.
+    limit = float(np.quantile(np.abs(np.concatenate([*known.values()])), 0.999))
+    edges = np.linspace(-limit, limit, 61)
+    shown = Figure(
+        "Distribution of the error",
+        "measured − model [V]",
+        "share of rows [%]",
+        f"{expected}The outermost bars include everything beyond.",
+        hover="$name: @top{0.[00]} %<br>at @x{0.[000]} V",
+    )
+    for name, values in known.items():
+        counts = np.histogram(np.clip(values, -limit, limit), edges)[0]
+        bars = {"x": 0.5 * (edges[1:] + edges[:-1]), "top": 100.0 * counts / values.size}
+        style = {"fill_color": COLORS[name], "fill_alpha": 0.4, "line_color": None}
+        shown.draw("vbar", name, bars, width=float(edges[1] - edges[0]), **style)
+    return shown
 
 
 def _newton_figure(result: Identification, time: TimeFigures) -> Figure:
-    figure = time.figure(
+    return time.figure(
         "SoC from voltage alone",
         "state of charge [%]",
         "The voltage equation solved for SoC at each row by Newton's method, without counting. Mean"
         f" absolute error {number(result.soc_newton_mae_pct, 2, '%')}: the voltage error divided by"
         " the slope of the pseudo-OCV, so it is large where that is flat.",
+        {
+            "by Newton": _over_time(result, "soc_newton_pct"),
+            "counted": _over_time(result, "rows.soc_pct"),
+        },
         height=280,
-        names=True,
     )
-    newton = _over_time(result, "soc_newton_pct")
-    counted = _over_time(result, "rows.soc_pct")
-    time.line(figure, "Newton", newton, ORANGE, line_width=0.9, line_alpha=0.8)
-    return time.line(figure, "counted", counted, BLACK, line_width=2.0)
 
 
 def _resistance_figure(result: Identification) -> Figure:
@@ -256,36 +196,14 @@ def _resistance_figure(result: Identification) -> Figure:
     )
     current = np.concatenate([item.rows.currents_a[:, 0] for item in result.fits])
     drop = np.concatenate([item.rows.voltage_v - item.pseudo_ocv_v for item in result.fits])
-    figure.cloud("rows of the fit", current, drop, GREY)
+    figure.cloud("rows of the fit", current, drop)
     ends = np.array([current.min(), current.max()])
     line = float(drop.mean()) - result.slope_ohm * (ends - float(current.mean()))
     figure.line(f"slope {slope}", ends, line, ORANGE, line_width=2.2)
     return figure
 
 
-def _energy(result: Identification) -> Table:
-    energy = result.energy
-
-    def share(part: float, whole: float) -> str:
-        return number(100.0 * part / whole if whole > 0.0 else None, 1, "%")
-
-    regenerated = share(energy.regenerated_kwh, energy.driven_kwh)
-    rows = [
-        ["driven", significant(energy.driven_kwh, 3), "", "∫U·I over I > 0"],
-        ["regenerated", significant(energy.regenerated_kwh, 3), regenerated, "∫U·I over I < 0"],
-        ["net", significant(energy.net_kwh, 3), "", "driven − regenerated"],
-        [
-            "Joule heat",
-            significant(energy.heat_kwh, 3),
-            share(energy.heat_kwh, energy.net_kwh),
-            "slope resistance × ∫I²",
-        ],
-        ["efficiency", "", number(energy.efficiency_pct, 1, "%"), "net / (net + heat)"],
-    ]
-    return Table(["energy at the terminals", "kWh", "share", "definition"], rows)
-
-
-def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
+def _recorded_figures(result: Identification, time: TimeFigures) -> list[Figure]:
     """Return current, voltage and temperature of the whole logs."""
     logs = result.logs
     running = np.concatenate(
@@ -293,178 +211,51 @@ def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
     )
     is_limited = running.size < sum(map(len, logs))
     below = " Start-up and shut-down rows lie below the figure." if is_limited else ""
-    caption = "Positive current discharges the pack, negative charges it."
-    pieces = [(log.time_s, log.current_a) for log in logs]
-    current = time.channel("current", "A", pieces, BLUE, caption, names=True)
-    caption = f"The voltage falls with the charge and dips under load.{below}"
-    pieces = [(log.time_s, log.voltage_v) for log in logs]
-    voltage = time.channel("voltage", "V", pieces, BLACK, caption)
+    figures = [
+        time.channel(logs, "current", "Positive current discharges the pack, negative charges it."),
+        time.channel(
+            logs,
+            "voltage",
+            f"The voltage falls with the charge and dips under load.{below}",
+        ),
+        time.channel(
+            logs,
+            "temperature",
+            f"Measured on: {result.model.temperature_source}. A temperature that hardly changes"
+            " does not identify kt.",
+        ),
+    ]
     if is_limited:
-        voltage.set_y_limits(float(running.min()), float(running.max()))
-    caption = f"Measured on: {result.model.temperature_source}. A temperature that hardly changes"
-    caption += " does not identify kt."
-    pieces = [(log.time_s, log.temperature_c) for log in logs]
-    return [current, voltage, time.channel("temperature", "°C", pieces, ORANGE, caption)]
+        figures[1].set_y_limits(float(running.min()), float(running.max()))
+    return figures
 
 
-# --- Tables
-
-
-def _coefficients(model: Model, condition_number: float) -> list[Block]:
-    """Return the coefficients of a model: loads, and the published equation where identified."""
-    blocks: list[Block] = []
-    if model.loads is not None:
-        loads = model.loads
-        names = [f"current {d:g} s ago" if d else "current" for d in loads.delays_s]
-        names += [f"current low-passed with {tau:g} s" for tau in loads.low_pass_s]
-        rows = [["temperature coefficient", significant(loads.kt_v_per_k, 3), "V/K"]]
-        rows += [
-            [f"resistance: {name}", significant(ohm, 3), "Ω"]
-            for name, ohm in zip(names, loads.resistance_ohm, strict=True)
-        ]
-        if loads.arrhenius is not None:
-            part = number(loads.arrhenius.factor, 2)
-            rows.append(["part of the resistance that follows Arrhenius", part, ""])
-        note = (
-            "U = g(S) + kt·(T − Tr) + Σ Rm·Im + b·(a(T)/a(mean T) − 1)·Σ Rm·Im, with g the curve"
-            " through knots."
-        )
-        blocks.append(Table(["coefficient", "value", "unit"], rows, note))
-    if model.published is not None:
-        blocks.append(_published_table(model.published, condition_number))
-    return blocks
-
-
-def _with_error(value: float, std_error: float | None) -> tuple[str, str]:
+def _with_error(value: float, std_error: float | None) -> list[str]:
     """Return a value rounded to its standard error, and the error with two digits.
 
-    A value that is its own noise is a dash.
+    A value within two standard errors of zero, 95 %, may as well be zero: it is a dash.
     """
     if not std_error or not math.isfinite(std_error):
-        return significant(value, 3), significant(std_error, 2)
-    if abs(value) < OWN_NOISE * std_error:
-        return NONE_KNOWN, significant(std_error, 2)
+        return [significant(value, 3), significant(std_error, 2)]
     decimals = max(0, 1 - math.floor(math.log10(std_error)))
-    return number(value, decimals), significant(std_error, 2)
+    shown = number(value, decimals) if abs(value) >= 2.0 * std_error else NONE_KNOWN
+    return [shown, significant(std_error, 2)]
 
 
-def _published_table(model: Published, condition_number: float) -> Table:
-    factors = {
-        "k0": "1",
-        "k1": "1/s",
-        "k2": "1/s²",
-        "k3": "1/s³",
-        "k4": "1/s⁴",
-        "k5": "s",
-        "k6": "ln s",
-        "k7": "ln(1 − s)",
-        "kt": f"T − {model.t_ref_c:g} °C",
-    }
-    for place, delay_s in enumerate(model.delays_s, start=1):
-        factors[f"R{place}"] = f"current {delay_s:g} s ago" if delay_s else "current"
-    rows = []
-    for name, item in model.coefficients.items():
-        ratio = abs(item.value) / item.std_error if item.std_error else math.nan
-        value = _with_error(item.value, item.std_error)
-        rows.append([name, *value, number(ratio, 1), _UNITS[item.unit], factors[name]])
-    return Table(
-        ["published coefficient", "value", "std. error", "|value| / error", "unit", "multiplies"],
-        rows,
-        "U = k0 + k1/s + k2/s² + k3/s³ + k4/s⁴ + k5·s + k6·ln s + k7·ln(1 − s) + kt·(T − Tr)"
-        f" + Σ Rj·I(t − dj),  s = S/100·(1 − 2ε) + ε, ε = {model.epsilon:g}: the published equation"
-        " by plain least squares of the same rows. Rows of a minute count as one in the standard"
-        " errors; a dash is a coefficient within two of them of zero. k0 … k7 are strongly"
-        f" correlated (condition number {significant(condition_number, 2)}): use their sum, the"
-        " curve, not single values.",
-    )
+def _held_out_mae_pct(result: Identification) -> list[float | None]:
+    """Return the mean absolute error of each log on rows held out of its fit [%]."""
+    found: list[float | None] = [None] * len(result.fits)
+    for k, error_v in enumerate(result.held_out_error_v):
+        relative = np.abs(error_v) / result.fits[k].rows.voltage_v
+        if np.isfinite(relative).any():
+            found[k] = 100.0 * float(np.nanmean(relative))
+    return found
 
 
-def _effects(result: Identification) -> list[Block]:
-    if result.effects is None:
-        return []
-    ids = dict.fromkeys(entry["id"] for entry in result.model.effects)
-    note = "No effect is significant in these logs."
-    if ids:
-        note = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)
-        note += ". An effect is a signature at the terminals, not proof of a mechanism."
-    parameters = [
-        {
-            "effect": effect.id,
-            "parameter": parameter.name,
-            "value": significant(values[parameter.name], 4),
-            "unit": "" if parameter.unit == "1" else parameter.unit.replace("ohm", "Ω"),
-        }
-        for effect, values in result.model.extended_model().effects
-        for parameter in effect.parameters
-    ]
-    steps = [
-        {
-            "effect": step.effect,
-            "step": step.step,
-            "left out without [V]": significant(step.held_out_rmse_without_v, 3),
-            "with [V]": significant(step.held_out_rmse_with_v, 3),
-            "t": number(step.t_value, 1),
-        }
-        for step in result.effects.steps
-    ]
-    searched = Table.of(
-        steps,
-        "Errors of left-out logs. An effect is added if the mean logarithm of the error ratio, log"
-        " by log, is significantly above zero (t of 2 or more) and worth at least 3 %. The same"
-        " data selected the effects, so the last figure is slightly optimistic.",
-    )
-    return [Table.of(parameters, note) if parameters else note, *([searched] if steps else [])]
-
-
-def _settings(model: Model) -> Table:
-    """Return how a model was made, and the range that it is known in."""
-    cells = "" if model.cells is None else f", {model.cells} cells in series"
-    rows = [
-        ["equation", model.equation],
-        ["chemistry", f"{model.chemistry}{cells}"],
-        ["capacity", number(model.capacity_ah, 2, "Ah")],
-        ["rate", f"{model.rate_hz:g} Hz"],
-        ["temperature measured on", model.temperature_source],
-        *range_rows(model),
-        ["made by", model.made.by],
-    ]
-    return Table(["model", ""], rows)
-
-
-def _method(result: Identification) -> list[Block]:
-    by_text: dict[str, list[str]] = {}
+def _remarks(result: Identification) -> Sequence[str]:
+    """Return the remarks of the fit, and each of the logs with the names of those that have it."""
+    names: dict[str, list[str]] = {}
     for log in result.logs:
         for remark in log.remarks:
-            by_text.setdefault(remark, []).append(log.name)
-    remarks = [*result.remarks, *(f"{', '.join(names)}: {text}" for text, names in by_text.items())]
-    blocks: list[Block] = [_settings(result.model), _logs(result)]
-    return [*blocks, "Remarks:", remarks] if remarks else blocks
-
-
-def _logs(result: Identification) -> Table:
-    removed: Counter[str] = Counter()
-    for item in result.fits:
-        removed.update(item.rows.removed)
-    unused = "; ".join(
-        f"{count:,} {_REMOVED_BY.get(rule, rule)}" for rule, count in removed.items()
-    )
-    errors = result.held_out_error_v or [np.full(len(item.rows), np.nan) for item in result.fits]
-    entries = []
-    for log, item, error_v in zip(result.logs, result.fits, errors, strict=True):
-        soc, judged = item.rows.soc_pct, np.isfinite(error_v)
-        relative = np.abs(error_v[judged]) / item.rows.voltage_v[judged]
-        held_out_pct = 100.0 * float(relative.mean()) if judged.any() else None
-        entry = {
-            "log": log.name,
-            "duration": duration(log.duration_s),
-            "rows": str(len(log)),
-            "rows used": str(len(item.rows)),
-            "SoC [%]": span(soc.max(), soc.min(), 1),
-            "temperature [°C]": span(log.temperature_c.min(), log.temperature_c.max(), 1),
-            "current [A]": span(log.current_a.min(), log.current_a.max(), 0),
-            "U MAE [%]": number(item.voltage_mae_pct, 2),
-            "U MAE held out [%]": number(held_out_pct, 2),
-            "SoC by Newton MAE [%]": number(item.soc_newton_mae_pct, 2),
-        }
-        entries.append(entry)
-    return Table.of(entries, f"Rows not used: {unused}." if unused else "")
+            names.setdefault(remark, []).append(log.name)
+    return [*result.remarks, *(f"{', '.join(names[text])}: {text}" for text in names)]

@@ -7,7 +7,7 @@ no network and stays readable.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -16,10 +16,10 @@ from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.resources import Resources
 from bokeh.themes import Theme
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from cangauge._files import file_sha256, text_sha256
-from cangauge._text import is_numeric, span
+from cangauge._text import duration, is_numeric, number, significant, span
 from cangauge._version import __version__
 from cangauge.bus.recording import CaptureSamples
 from cangauge.extras.report.charts import MAX_POINTS, Figure
@@ -50,12 +50,6 @@ class Table:
     rows: Sequence[Sequence[str]]
     note: str = ""
 
-    @classmethod
-    def of(cls, entries: Sequence[Mapping[str, str]], note: str = "") -> Table:
-        """Return a table with a row for each entry, a mapping of heading to text."""
-        head = list(entries[0]) if entries else []
-        return cls(head, [list(entry.values()) for entry in entries], note)
-
     @property
     def is_numeric(self) -> list[bool]:
         """Whether each column holds nothing but numbers."""
@@ -67,12 +61,40 @@ Block = str | Table | Figure | Sequence[str] | Sequence[Figure]
 """A paragraph, a table, a figure, a list of remarks, or figures side by side."""
 
 
+def joined(names: Sequence[str], at_most: int = 3) -> str:
+    """Return names for a title: the first few, and how many more there are."""
+    if len(names) <= at_most:
+        return ", ".join(names)
+    return f"{', '.join(names[: at_most - 1])} and {len(names) - at_most + 1} more"
+
+
 def _is_figure(block: Block) -> bool:
     return isinstance(block, Figure)
 
 
 def _is_table(block: Block) -> bool:
     return isinstance(block, Table)
+
+
+_PAGE: Final = "page.html.j2"
+_ENVIRONMENT: Final = Environment(
+    loader=FileSystemLoader(_TEMPLATES),
+    autoescape=select_autoescape(["html.j2"]),  # the others give plain text, escaped there
+    undefined=StrictUndefined,
+    extensions=["jinja2.ext.do"],
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_ENVIRONMENT.tests |= {"figure": _is_figure, "table": _is_table}
+_ENVIRONMENT.globals |= {"Table": Table, "Tile": Tile}
+_ENVIRONMENT.filters |= {
+    "duration": duration,
+    "file_sha256": file_sha256,
+    "joined": joined,
+    "number": number,
+    "significant": significant,
+    "span": span,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +132,21 @@ class Page:
     logs: Sequence[Log | CaptureSamples] = ()
     warnings: Sequence[str] = ()
 
+    @classmethod
+    def of(cls, template: str, values: Mapping[str, Any]) -> Page:
+        """Return the page that a template describes: its variables are parameters of this class.
+
+        Parameters
+        ----------
+        template : str
+            File in the folder `templates`.
+        values : mapping of str to object
+            What it names.
+        """
+        described = vars(_ENVIRONMENT.get_template(template).make_module(dict(values)))
+        names = {each.name for each in fields(cls)} & described.keys()
+        return cls(**{name: described[name] for name in names})
+
     @property
     def figures(self) -> list[Figure]:
         """All figures in the order of the page."""
@@ -128,14 +165,6 @@ class Page:
             script, drawn = components([item.plot for item in figures], theme=theme)
             # Only bokeh's core: its widgets, tables and formulae would add 2.7 MB.
             bokeh_js = Resources(mode="inline", components=["bokeh"]).render()
-        environment = Environment(
-            loader=FileSystemLoader(_TEMPLATES),
-            autoescape=True,
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        environment.tests |= {"figure": _is_figure, "table": _is_table}
         texts = [text for log in self.logs for text in (log.name, log.source, *log.remarks)]
         is_reconstruction = any("reconstruction" in text.lower() for text in texts)
         parts = [
@@ -144,7 +173,7 @@ class Page:
             for title, blocks in of.items()
             if blocks
         ]
-        return environment.get_template("page.html.j2").render(
+        return _ENVIRONMENT.get_template(_PAGE).render(
             page=self,
             parts=parts,
             inputs=self._inputs(),
@@ -176,19 +205,3 @@ def _add_to_document(plots: Sequence[Any]) -> None:
     with document.models.freeze():
         for plot in plots:
             document.add_root(plot)
-
-
-def joined(names: Sequence[str], at_most: int = 3) -> str:
-    """Return names for a title: the first few, and how many more there are."""
-    if len(names) <= at_most:
-        return ", ".join(names)
-    return f"{', '.join(names[: at_most - 1])} and {len(names) - at_most + 1} more"
-
-
-def range_rows(model: Model) -> list[list[str]]:
-    """Return rows of the range that a model is identified in."""
-    return [
-        ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
-        ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
-        ["identified at current", span(*model.range.current_a, 0, "A")],
-    ]
