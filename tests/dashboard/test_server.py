@@ -14,13 +14,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from tornado.websocket import websocket_connect
 
 from cangauge.bus.open import BusAddress
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.extras.live.addresses import http_address
+from cangauge.extras.live.history import COLUMNS, Span
 from cangauge.extras.live.launch import Live
+from cangauge.extras.live.server import LivePage
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
 from cangauge.service.status import Monitor
@@ -125,6 +129,54 @@ def test_a_slow_viewer_does_not_hold_the_others(page: Served) -> None:
         for _ in range(20):
             page.show(snapshot())
             assert get(page, "/rows?span=10min")[0] == 200
+
+
+class CountedSpan(Span):
+    """Counts the rows that are read."""
+
+    rows_read = 0
+
+    def rows(self, after: int = 0) -> np.ndarray:
+        found = super().rows(after)
+        self.rows_read += len(found)
+        return found
+
+
+def test_a_span_is_read_once_however_many_ask_for_it() -> None:
+    async def rows_read() -> int:
+        page = LivePage(http_address("0", None, {}, "dashboard"))
+        page.history.spans["all"] = span = CountedSpan(0.1, 6000)
+        for tenth in range(6050):
+            span.add(np.full(len(COLUMNS), 100.0 * tenth))
+        key = json.loads(page.answer("all", "", 0)[0])["key"]
+        for after in range(50):
+            span.add(np.full(len(COLUMNS), 1e6 + 100.0 * after))
+            for _ in range(50):
+                for known in ("", key):
+                    text, *_ = page.answer("all", known, after)
+                    assert len(json.loads(text)["columns"]["time_ms"]) == 6000
+        return span.rows_read
+
+    assert asyncio.run(rows_read()) == 6000
+
+
+def test_a_viewer_that_lacks_few_rows_is_sent_those() -> None:
+    async def lacking(rows: int) -> dict[str, Any]:
+        page = LivePage(http_address("0", None, {}, "dashboard"))
+        span = page.history.spans["10min"]
+        for tenth in range(1000):
+            span.add(np.full(len(COLUMNS), 100.0 * tenth))
+        key = json.loads(page.answer("10min", "", 0)[0])["key"]
+        found: dict[str, Any] = json.loads(page.answer("10min", key, 1000 - rows)[0])
+        return found
+
+    for rows in (0, 1, 100):
+        answer = asyncio.run(lacking(rows))
+        assert answer["is_known"]
+        assert len(answer["columns"]["time_ms"]) == rows
+    whole = asyncio.run(lacking(900))
+    assert not whole["is_known"]
+    assert len(whole["columns"]["time_ms"]) == whole["added"] == 1000
 
 
 UPGRADE = {

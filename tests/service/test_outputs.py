@@ -20,7 +20,6 @@ def test_a_service_without_outputs_needs_the_light_install_alone() -> None:
         "filterpy",
         "jinja2",
         "matplotlib",
-        "paho",
         "pyarrow",
         "threadpoolctl",
         "tornado",

@@ -18,7 +18,6 @@ from bokeh.plotting import figure
 
 from cangauge.extras.live.history import COLUMNS
 from cangauge.extras.report.charts import AMBER, BLUE, GREEN, GREY, ORANGE
-from cangauge.types import Status
 
 STATUS_COLOURS: Final = {"valid": GREEN, "degraded": AMBER, "invalid": ORANGE, "initialising": GREY}
 """From the best to the worst known; each has its own line, so colour is not the only sign."""
@@ -180,7 +179,3 @@ def _timeline(runs: ColumnDataSource, shared: Range1d) -> Any:
     )
     plot.add_tools(HoverTool(tooltips="@status: @words", mode="mouse"))
     return plot
-
-
-STATUS_NAMES: Final = {int(each): each.name.lower() for each in Status}
-"""Names of the status by their numbers."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections import deque
@@ -10,17 +11,14 @@ from typing import Any, Final
 
 import numpy as np
 
+from cangauge._text import plain
 from cangauge._typing import FloatArray
 from cangauge.service.status_client import SHOW_EVERY_S
-from cangauge.types import REASON_WORDS, Reason, Status, reason_name
+from cangauge.types import Reason, Status
 
 SILENT_AFTER_S: Final = 0.7
 """Time without a status after which the service counts as gone, and without a sample the bus as
-silent [s]: seen within a second."""
-SILENT_INTERVALS: Final = 3.0
-"""The same on a bus whose samples come seldom, in intervals of the samples."""
-RATE_OVER_S: Final = 1.0
-"""Averaging time of rates and latency [s]."""
+silent [s]: seen within a second. On a slower bus it is the time of three samples."""
 
 COLUMNS: Final = {
     "time_ms": 0,
@@ -42,16 +40,8 @@ COLUMNS: Final = {
     "reasons": 0,
 }
 """Columns of the history, with the decimals shown to viewers. `time_ms` is wall-clock time
-[ms since 1970] and `time_s` bus time; status and reasons are the numbers of the published frame."""
-_AT: Final = {name: place for place, name in enumerate(COLUMNS)}
-_STATUS: Final = {each.name.lower(): float(each) for each in Status}
-_REASON: Final = {reason_name(each).replace(" ", "_"): int(each) for each in Reason if each}
-REASONS: Final = {
-    str(int(each)): REASON_WORDS.get(each, reason_name(each)) for each in Reason if each
-}
-"""Reasons in plain words, by their numbers."""
-
-
+[ms since 1970] and `time_s` bus time; status and reasons are the numbers of the published frame.
+Rates and latency are those of the last second."""
 LOG_NAME: Final = "cangauge-last-hour.csv"
 LOG_COLUMNS: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
 
@@ -67,39 +57,53 @@ class Span:
     thins : bool
         Keep everything since the start: where the array is full, drop every other row and double
         the interval. Otherwise the oldest row goes.
+
+    Attributes
+    ----------
+    added : int
+        Number of rows ever added.
+    generation : int
+        Changes where rows were thinned: rows read earlier are no longer a part of these.
     """
 
     def __init__(self, every_s: float, rows_at_most: int, *, thins: bool = False) -> None:
         self.every_s = every_s
         self.rows_at_most = rows_at_most
-        self.added = 0
-        """Number of rows ever added."""
-        self.generation = 0
-        """Changes where rows were thinned: rows read earlier are no longer a part of these."""
+        self.added = self.generation = 0
         self._thins = thins
-        self._kept = 0
         self._rows = np.full((rows_at_most, len(COLUMNS)), math.nan)
 
     def add(self, row: FloatArray) -> None:
         """Add a row, unless it comes too early for this rate."""
-        if self._kept:
+        if self.added:
             waited_s = 1e-3 * (row[0] - self._rows[(self.added - 1) % self.rows_at_most, 0])
             if 0.0 <= waited_s < self.every_s - 0.5 * SHOW_EVERY_S:
                 return
-        if self._thins and self._kept == self.rows_at_most:
-            half = self.rows()[::2].copy()
+        if self._thins and self.added == self.rows_at_most:
+            half = self._rows[::2].copy()
             self._rows[: len(half)] = half
-            self.added = self._kept = len(half)
+            self.added = len(half)
             self.every_s *= 2.0
             self.generation += 1
         self._rows[self.added % self.rows_at_most] = row
         self.added += 1
-        self._kept = min(self._kept + 1, self.rows_at_most)
 
     def rows(self, after: int = 0) -> FloatArray:
         """Return the rows after the first `after` ever added, as far as they are kept; a copy."""
-        new = min(max(self.added - after, 0), self._kept)
-        return self._rows[np.arange(self.added - new, self.added) % self.rows_at_most]
+        first = max(after, self.added - self.rows_at_most, 0)
+        return self._rows[np.arange(first, self.added) % self.rows_at_most]
+
+    def columns(self, after: int = 0) -> dict[str, list[float]]:
+        """Return such rows as columns of rounded numbers; NaN where a value is unknown."""
+        values = self.rows(after).T
+        return {
+            name: np.round(column, digits).tolist()
+            for (name, digits), column in zip(COLUMNS.items(), values, strict=True)
+        }
+
+    def to_json(self, after: int = 0) -> str:
+        """Return such columns as a JSON object; null where a value is unknown."""
+        return json.dumps(plain(self.columns(after)))
 
 
 class History:
@@ -141,17 +145,16 @@ class History:
         self.status, self._received_s = status, now_s
         if status["samples"] != self._samples:
             self._samples, self._sample_s = status["samples"], status["uptime_s"]
-        rate = _number(status["samples_per_s"])
+        rate = status["samples_per_s"] or 0.0
         if _age_s(status) <= SILENT_AFTER_S and rate > 0.0:
             self._interval_s = 1.0 / rate
         row = self._row(status, now_s)
-        self.hour.add(row)
-        for span in self.spans.values():
+        for span in (self.hour, *self.spans.values()):
             span.add(row)
 
-    def latest(self) -> dict[str, float | None]:
-        """Return the columns of the latest row, {} before the first."""
-        columns = shown_columns(self.hour.rows(max(self.hour.added - 1, 0)))
+    def latest(self) -> dict[str, float]:
+        """Return the columns of the latest row, {} before the first; NaN: unknown."""
+        columns = self.hour.columns(self.hour.added - 1)
         return {name: values[0] for name, values in columns.items() if values}
 
     def troubles(self) -> list[str]:
@@ -168,47 +171,64 @@ class History:
             found.append(f"The bus is lost: {status['bus_trouble'] or 'no reason known'}.")
         # A sample may be old because it waited: the service then works through what has come.
         age_s = min(_age_s(status), status["uptime_s"] - self._sample_s)
-        if age_s > max(SILENT_AFTER_S, SILENT_INTERVALS * self._interval_s):
-            found.append(f"The bus is silent: no sample for {age_s:.1f} s.")
-        elif status["sample"] is None:
+        if status["sample"] is None:
             found.append("The bus is silent: no sample yet.")
+        elif age_s > max(SILENT_AFTER_S, 3.0 * self._interval_s):
+            found.append(f"The bus is silent: no sample for {age_s:.1f} s.")
         if problem := status["config"]["problem"]:
             found.append(f"The latest configuration was refused: {problem}.")
         return [*found, *(f"{notice}." for notice in status["notices"])]
 
+    def last_hour(self) -> str:
+        """Return the last hour as a log that `cangauge gap` reads: CSV on bus time.
+
+        A row is kept where bus time has moved on; times begin at the first row after the latest
+        jump back, as after a restart.
+        """
+        places = [list(COLUMNS).index(name) for name in LOG_COLUMNS]
+        values = self.hour.rows()[:, places]
+        values = values[np.isfinite(values[:, :2]).all(axis=1)]
+        back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
+        values = values[back[-1] + 1 :] if back.size else values
+        lines, before_s = [",".join(LOG_COLUMNS)], -math.inf
+        for time_s, *measured in values.tolist():
+            if time_s > before_s:
+                cells = ["" if math.isnan(value) else f"{value:.6g}" for value in measured]
+                lines.append(f"{time_s:.6f},{','.join(cells)}")
+            before_s = time_s
+        return "\n".join([*lines, ""])
+
     def _row(self, status: Mapping[str, Any], now_s: float) -> FloatArray:
-        estimate, sample = status["estimate"], status["sample"] or {}
-        values = {name: _number(estimate.get(name)) for name in COLUMNS}
-        values |= {
-            name: _number(sample.get(name)) for name in ("current_a", "voltage_v", "temperature_c")
-        }
-        two_sigma = 2.0 * _number(estimate["soc_std_pct"])
+        values = dict.fromkeys(COLUMNS, math.nan)
+        for name, value in (status["estimate"] | (status["sample"] or {})).items():
+            if name in COLUMNS and value is not None:
+                values[name] = value
+        two_sigma = 2.0 * _number(status["estimate"]["soc_std_pct"])
         values["time_ms"] = 1e3 * now_s
         values["soc_low_pct"] = max(values["soc_pct"] - two_sigma, 0.0)
         values["soc_high_pct"] = min(values["soc_pct"] + two_sigma, 100.0)
-        values["residual_mv"] = 1e3 * _number(estimate["residual_v"])
+        values["residual_mv"] = 1e3 * _number(status["estimate"]["residual_v"])
         values |= self._rates(status)
-        values["status"] = _STATUS[status["status"]]
-        values["reasons"] = float(sum(_REASON[each] for each in status["reasons"]))
-        return np.array(list(values.values()))
+        values["status"] = Status[status["status"].upper()]
+        values["reasons"] = sum(Reason[name.upper()] for name in status["reasons"])
+        return np.array([*values.values()], dtype=np.float64)
 
     def _rates(self, status: Mapping[str, Any]) -> dict[str, float]:
         """Return frames and rejects per second and the mean latency, of the last second."""
-        latency = status["latency"]
-        counts = self._counts
+        latency, counts = status["latency"], self._counts
         counts.append(
             (
-                float(status["uptime_s"]),
-                float(status["frames"]["received"]),
-                float(sum(status["rejects"].values())),
-                float(latency["count"]),
-                float(latency["count"] * (latency["mean_s"] or 0.0)),
+                status["uptime_s"],
+                status["frames"]["received"],
+                sum(status["rejects"].values()),
+                latency["count"],
+                latency["count"] * (latency["mean_s"] or 0.0),
             )
         )
-        while len(counts) > 2 and counts[-1][0] - counts[1][0] >= RATE_OVER_S:
+        while len(counts) > 2 and counts[-1][0] - counts[1][0] >= 1.0:
             counts.popleft()
         seconds, frames, rejects, published, latency_s = np.subtract(counts[-1], counts[0]).tolist()
-        if seconds < 0.5 * RATE_OVER_S:
+        if seconds < 0.5:
             return {}
         return {
             "frames_per_s": frames / seconds,
@@ -217,40 +237,10 @@ class History:
         }
 
 
-def last_hour(history: History) -> str:
-    """Return the last hour as a log that `cangauge gap` reads: CSV on bus time.
-
-    A row is kept where bus time has moved on; times begin at the first row after the latest jump
-    back, as after a restart.
-    """
-    rows = history.hour.rows()
-    values = np.stack([column(rows, name) for name in LOG_COLUMNS], axis=1)
-    values = values[np.isfinite(values[:, :2]).all(axis=1)]
-    back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
-    values = values[back[-1] + 1 :] if back.size else values
-    values = values[np.diff(values[:, 0], prepend=-math.inf) > 0.0]
-    lines = [",".join("" if math.isnan(v) else f"{v:.6g}" for v in row[1:]) for row in values]
-    stamps = [f"{time_s:.6f}" for time_s in values[:, 0]]
-    return "\n".join([",".join(LOG_COLUMNS), *map(",".join, zip(stamps, lines, strict=True)), ""])
-
-
-def column(rows: FloatArray, name: str) -> FloatArray:
-    """Return a column of rows by its name."""
-    return rows[:, _AT[name]]
-
-
-def shown_columns(rows: FloatArray) -> dict[str, list[float | None]]:
-    """Return rows as columns of rounded numbers; None where a value is unknown."""
-    shown = {}
-    for place, (name, digits) in enumerate(COLUMNS.items()):
-        values = np.round(rows[:, place], digits).tolist()
-        shown[name] = [None if math.isnan(value) else value for value in values]
-    return shown
-
-
 def _age_s(status: Mapping[str, Any]) -> float:
+    """Return the age of the latest sample [s]; NaN without one."""
     return _number((status["sample"] or {}).get("age_s"))
 
 
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -63,10 +63,8 @@ class Site(Output):
         Of the pages, with "{}" for the address, to log where they are.
     routes : dict
         Pages by patterns of their paths.
-    elsewhere : str
-        Answer of all other paths.
-    **limits
-        Of tornado's `HTTPServer`.
+    keeps_alive : bool
+        A connection may ask several times, or become a WebSocket.
 
     Raises
     ------
@@ -82,15 +80,9 @@ class Site(Output):
     cookie: str | None = None
 
     def __init__(
-        self,
-        address: HttpAddress,
-        title: str,
-        routes: Routes,
-        elsewhere: str,
-        **limits: Any,
+        self, address: HttpAddress, title: str, routes: Routes, *, keeps_alive: bool = False
     ) -> None:
         self.token = address.token
-        self.elsewhere = elsewhere
         self._blocked_until_s: dict[str, float] = {}  # by peer: a second for each wrong token
         application = Application(
             [
@@ -103,8 +95,16 @@ class Site(Output):
         )
         listening = address.listen()
         listening.setblocking(False)
-        sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
-        _Server(application, **sizes, **limits).add_socket(listening)
+        server = _Server(
+            application,
+            no_keep_alive=not keeps_alive,
+            max_header_size=MAX_HEADER_BYTES,
+            max_body_size=MAX_BODY_BYTES,
+            max_buffer_size=MAX_HEADER_BYTES + MAX_BODY_BYTES,
+            idle_connection_timeout=REQUEST_WITHIN_S,
+            body_timeout=REQUEST_WITHIN_S,
+        )
+        server.add_socket(listening)
         port = listening.getsockname()[1]
         access = "without a token" if self.token is None else "with a token"
         text = f"{title.format(replace(address, port=port))}, {access}"
@@ -140,16 +140,7 @@ class StatusServer(Site):
 
     def __init__(self, address: HttpAddress) -> None:
         self.latest: Snapshot | None = None
-        super().__init__(
-            address,
-            "status: http://{}/status",
-            {"/(status|healthz|metrics)": (StatusPage, True), ".*": (Nothing, True)},
-            "available: /status, /healthz, /metrics",
-            no_keep_alive=True,
-            max_buffer_size=MAX_HEADER_BYTES + MAX_BODY_BYTES,
-            idle_connection_timeout=REQUEST_WITHIN_S,
-            body_timeout=REQUEST_WITHIN_S,
-        )
+        super().__init__(address, "status: http://{}/status", {"/(.*)": (StatusPage, True)})
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
@@ -229,10 +220,10 @@ class Handler(RequestHandler):
         """Answer with tornado's reason, without a trace."""
         self.refuse(status_code, f"{status_code} {self._reason}")
 
-    def send_json(self, content: dict[str, Any]) -> None:
-        """Answer with a JSON object; a number that is not finite is null."""
+    def send_json(self, text: str) -> None:
+        """Answer with JSON."""
         self.set_header("Content-Type", "application/json")
-        self.finish(json.dumps(plain(content), ensure_ascii=False) + "\n")
+        self.finish(text + "\n")
 
 
 class StatusPage(Handler):
@@ -240,17 +231,19 @@ class StatusPage(Handler):
 
     def get(self, name: str) -> None:
         """Answer a request for "status", "healthz" or "metrics"."""
-        if self.site.latest is None:
+        if name not in {"status", "healthz", "metrics"}:
+            self.refuse(404, "available: /status, /healthz, /metrics")
+        elif self.site.latest is None:
             self.refuse(503, "the service has just started")
-            return
-        status = self.site.latest.at(time.monotonic())
-        if name == "status":
-            self.send_json(status)
-        elif name == "healthz":  # the status has the validity of the SoC
-            self.set_status(503 if status["loop_stuck"] else 200)
-            self.send_json({"ok": not status["loop_stuck"], "status": status["status"]})
         else:
-            self._send_metrics(status)
+            getattr(self, f"_send_{name}")(self.site.latest.at(time.monotonic()))
+
+    def _send_status(self, status: dict[str, Any]) -> None:
+        self.send_json(to_json(status))
+
+    def _send_healthz(self, status: dict[str, Any]) -> None:  # the status has the SoC's validity
+        self.set_status(503 if status["loop_stuck"] else 200)
+        self.send_json(to_json({"ok": not status["loop_stuck"], "status": status["status"]}))
 
     def _send_metrics(self, status: dict[str, Any]) -> None:
         try:
@@ -264,11 +257,6 @@ class StatusPage(Handler):
         self.finish(body)
 
 
-class Nothing(Handler):
-    """Answer of all other paths."""
-
-    def prepare(self) -> None:
-        """Refuse any request."""
-        super().prepare()
-        if not self._finished:
-            self.refuse(404, self.site.elsewhere)
+def to_json(content: dict[str, Any]) -> str:
+    """Return a JSON object; a number that is not finite is null."""
+    return json.dumps(plain(content), ensure_ascii=False)

@@ -1,7 +1,8 @@
 """Answer the browsers of the live page.
 
 Each viewer is sent what is new once it has taken what came before, so a slow or hidden one costs
-nothing, here or in the service.
+nothing, here or in the service. A whole span is made once for all who ask for it, so many questions
+do not delay other viewers.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import re
 import secrets
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -22,13 +24,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge.extras.live.addresses import HttpAddress
-from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
-from cangauge.extras.live.history import LOG_NAME, REASONS, History, last_hour, shown_columns
-from cangauge.extras.live.http import WRONG_FORMS, Handler, Nothing, Site
+from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, chart_parts
+from cangauge.extras.live.history import LOG_NAME, History
+from cangauge.extras.live.http import WRONG_FORMS, Handler, Site, to_json
 from cangauge.service.status_client import Snapshot
+from cangauge.types import REASON_WORDS, Status
 
-IDLE_S: Final = 30.0
-"""Time after which a connection without a request is closed [s]."""
+NEW_ROWS: Final = 200
+"""Most rows sent as new ones: 20 s of ten a second. A viewer that lacks more gets the whole span,
+which is at most half as many rows old."""
 ALIVE_S: Final = 0.25
 """Longest time without a message to a viewer [s]."""
 _FILES: Final = Path(__file__).with_name("page")
@@ -43,6 +47,7 @@ class LivePage(Site):
     def __init__(self, address: HttpAddress) -> None:
         self._turn = asyncio.Lock()
         self.history = History()
+        self._made: dict[str, tuple[str, int, str]] = {}
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
         self._news = asyncio.Event()
@@ -57,14 +62,11 @@ class LivePage(Site):
             "live page: http://{}/",
             {
                 "/(enter)?": (Entrance, False),
-                r"/files/([a-z.]+)": (StaticFile, False),
                 f"/(rows|{re.escape(LOG_NAME)})": (HistoryPage, True),
                 "/stream": (LiveStream, True),
-                ".*": (Nothing, False),  # browsers ask for /favicon.ico by themselves
+                "/(?:files/)?(.*)": (StaticFile, False),  # browsers ask for /favicon.ico too
             },
-            "there is nothing here: the live page is at /",
-            idle_connection_timeout=IDLE_S,
-            body_timeout=IDLE_S,
+            keeps_alive=True,
         )
 
     def _texts(self) -> dict[str, str]:
@@ -72,8 +74,8 @@ class LivePage(Site):
         script, elements = chart_parts()
         spans = self.history.spans.items()
         facts = {
-            "reasons": REASONS,
-            "statuses": STATUS_NAMES,
+            "reasons": {int(each): words for each, words in REASON_WORDS.items()},
+            "statuses": {int(each): each.name.lower() for each in Status},
             "colours": STATUS_COLOURS,
             "rows_at_most": {name: span.rows_at_most for name, span in spans},
         }
@@ -104,33 +106,48 @@ class LivePage(Site):
         async with self._turn:
             await asyncio.sleep(0.0)
 
-    def answer(self, name: str, key: str, after: int) -> dict[str, Any]:
-        """Return the status, what is wrong, and the rows of a span that are new to a viewer.
+    def answer(self, name: object, key: object, after: Any) -> tuple[str, str, int]:
+        """Return JSON with the status, what is wrong, and the rows of a span that a viewer lacks.
 
         Parameters
         ----------
         name : str
-            Name of the span; another one for no rows.
+            Name of the span; anything else for no rows.
         key : str
             Key of the answer that the viewer had last.
         after : int
             Number of rows ever added to the span then.
+
+        Returns
+        -------
+        str, str, int
+            The JSON; key and number to continue with.
         """
         history = self.history
         content: dict[str, Any] = {"status": history.status, "troubles": history.troubles()}
         content["latest"] = history.latest()
-        span = history.spans.get(name)
+        span = history.spans.get(str(name))
         if span is None:
-            return content
-        present = f"{self.id}-{span.generation}"
-        return content | {
-            "span": name,
-            "key": present,
-            "is_known": key == present,
-            "added": span.added,
-            "every_ms": 1e3 * span.every_s,
-            "columns": shown_columns(span.rows(after if key == present else 0)),
-        }
+            return to_json(content), "", 0
+        present, added = f"{self.id}-{span.generation}", span.added
+        is_known = key == present and isinstance(after, int) and 0 <= added - after <= NEW_ROWS
+        if is_known:
+            columns = span.to_json(after)
+        else:
+            added, columns = self.made(str(name), present, added, span.to_json, NEW_ROWS // 2)
+        about = {"span": name, "key": present, "is_known": is_known, "added": added}
+        text = to_json(content | about | {"every_ms": 1e3 * span.every_s})
+        return f'{text[:-1]}, "columns": {columns}}}', present, added
+
+    def made(
+        self, name: str, key: str, rows: int, make: Callable[[], str], lag: int = 0
+    ) -> tuple[int, str]:
+        """Return a text made of rows, and their number; made again once more than `lag` are new."""
+        made_key, made_rows, text = self._made.get(name, ("", 0, ""))
+        if made_key != key or rows - made_rows > lag:
+            made_rows, text = rows, make()
+            self._made[name] = key, rows, text
+        return made_rows, text
 
 
 class Entrance(Handler):
@@ -164,26 +181,28 @@ class StaticFile(Handler):
         """Send a file of the page."""
         kind = _TYPES.get(name.rpartition(".")[2])
         if kind is None or name not in self.site.texts:
-            self.refuse(404, "no such file")
+            self.refuse(404, "there is nothing here: the live page is at /")
             return
         self.set_header("Content-Type", kind)
         self.finish(self.site.texts[name])
 
 
 class HistoryPage(Handler):
-    """HistoryPage of the history: those that a viewer lacks, or a log of the last hour."""
+    """The history as JSON, those rows that a viewer lacks; or a log of the last hour."""
 
     async def get(self, name: str) -> None:
         """Send the status, what is wrong, and the rows of a span after those already known."""
         await self.site.in_turn()
         if name == LOG_NAME:
+            history = self.site.history
+            _, log = self.site.made(name, name, history.hour.added, history.last_hour)
             self.set_header("Content-Type", "text/csv; charset=utf-8")
             self.set_header("Content-Disposition", f'attachment; filename="{LOG_NAME}"')
-            self.finish(last_hour(self.site.history))
+            self.finish(log)
             return
         span, key, after = (self.get_query_argument(part, "") for part in ("span", "key", "after"))
         number = int(after) if after.isdecimal() and len(after) < 16 else 0
-        self.send_json(self.site.answer(span, key, number))
+        self.send_json(self.site.answer(span, key, number)[0])
 
 
 class LiveStream(WebSocketHandler, Handler):
@@ -216,10 +235,8 @@ class LiveStream(WebSocketHandler, Handler):
         with suppress(WebSocketClosedError):
             while True:
                 question = self._question
-                name, key, after = (question.get(part) for part in ("span", "key", "after"))
-                number = after if isinstance(after, int) and after >= 0 else 0
                 await self.site.in_turn()
-                answer = self.site.answer(str(name), str(key), number)
-                self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
-                await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
+                text, key, added = self.site.answer(*map(question.get, ("span", "key", "after")))
+                self._question = question | {"key": key, "after": added}
+                await self.write_message(text)
                 await self.site.news()

@@ -188,7 +188,7 @@
       values.forEach((value, index) => { if (value === null) values[index] = NaN; });
     }
     columns.time_ms = columns.time_ms.map(ms => ms + SHIFT_MS);
-    const fresh = answer.key !== key && !isContinued(answer);
+    const fresh = (answer.key !== key || !answer.is_known) && !isContinued(answer);
     if (fresh) [kept, dropped, extended] = [columns, 0, 0];
     else for (const [name, values] of Object.entries(columns)) kept[name].push(...values);
     const excess = Math.max(kept.time_ms.length - FACTS.rows_at_most[span], 0);
