@@ -27,7 +27,7 @@ def drive(pack: TwinPack) -> Drive:
         pack,
         hours=1.6,
         ambient_c=4.0,
-        start_soc=0.9,
-        end_soc=0.10,
+        start_soc_pct=90,
+        end_soc_pct=10,
         discharge=True,
     )

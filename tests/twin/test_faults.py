@@ -11,9 +11,9 @@ from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
 from cangauge.extras.validation.twin.faults import (
     Fault,
-    Faults,
     fault_kind,
     fault_kinds,
+    faults_by_id,
     is_reached,
 )
 from cangauge.extras.validation.twin.pack import TwinPack
@@ -51,8 +51,8 @@ def demanding_drive_of(pack: TwinPack) -> Drive:
         pack,
         hours=2.0,
         ambient_c=-6.0,
-        start_soc=0.85,
-        end_soc=0.08,
+        start_soc_pct=85,
+        end_soc_pct=8,
         discharge=True,
     )
     middle = drawn.time_s.size // 2
@@ -99,7 +99,7 @@ def test_fault_is_scaled_to_the_gap(
 
 @pytest.mark.parametrize("fault_id", ALL)
 def test_fault_of_size_zero_changes_nothing(fault_id: str) -> None:
-    assert not Faults.of([Fault(fault_id, 0.0)])
+    assert not faults_by_id([Fault(fault_id, 0.0)])
 
 
 # A late current is not the mirror image of an early one within the skew.
@@ -115,7 +115,7 @@ def test_negative_fault_opens_the_opposite_gap(
     fault, _ = scale_to_gap(pack, demanding_drive, Fault(fault_id, 1.0), 0.2, healthy)
     gaps = []
     for sign in (1.0, -1.0):
-        signed = Faults.of([replace(fault, size=sign * fault.size)])
+        signed = faults_by_id([replace(fault, size=sign * fault.size)])
         read = read_drive(pack, demanding_drive, signed, healthy)
         gaps.append(read.gap_v[: read.truth.rows])
     rows = min(gap.size for gap in gaps)
@@ -130,16 +130,16 @@ def test_sensor_faults_leave_the_truth_unchanged(
         Fault("current_offset", 2.0), Fault("current_gain", 0.05), Fault("voltage_offset", 1.0),
         Fault("voltage_gain", 0.01), Fault("time_skew", 1.5), Fault("temperature_lag", 900.0),
     ):  # fmt: skip
-        truth = simulate_truth(pack, demanding_drive, Faults.of([fault]), healthy)
+        truth = simulate_truth(pack, demanding_drive, faults_by_id([fault]), healthy)
         assert np.array_equal(truth.voltage_v, healthy.voltage_v)
-    read = read_drive(pack, demanding_drive, Faults.of([Fault("current_offset", 2.0)]), healthy)
+    read = read_drive(pack, demanding_drive, faults_by_id([Fault("current_offset", 2.0)]), healthy)
     np.testing.assert_allclose(read.current_a - demanding_drive.current_a, 2.0)
 
 
 def test_time_skew_delays_the_current(
     pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
-    condition = Faults.of([Fault("time_skew", 2.0)])
+    condition = faults_by_id([Fault("time_skew", 2.0)])
     measured = read_drive(pack, demanding_drive, condition, healthy).current_a
     rows = round(2.0 / demanding_drive.step_s)
     np.testing.assert_allclose(measured[rows:], demanding_drive.current_a[:-rows], atol=1e-9)
@@ -160,7 +160,7 @@ def test_resistance_step_acts_from_its_time_on(
     pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
     fault = Fault("resistance_step", 0.02, {"at_s": 2000.0})
-    truth = simulate_truth(pack, demanding_drive, Faults.of([fault]), healthy)
+    truth = simulate_truth(pack, demanding_drive, faults_by_id([fault]), healthy)
     gap = truth.voltage_v - healthy.voltage_v
     before = demanding_drive.time_s < 2000.0
     np.testing.assert_allclose(gap[before], 0.0, atol=2e-3)  # tolerance of the thermal iteration
@@ -172,7 +172,7 @@ def test_resistance_step_acts_from_its_time_on(
 def test_asymmetry_acts_during_charge_only(
     pack: TwinPack, demanding_drive: Drive, healthy: Response
 ) -> None:
-    condition = Faults.of([Fault("resistance_asymmetry", 0.05)])
+    condition = faults_by_id([Fault("resistance_asymmetry", 0.05)])
     truth = simulate_truth(pack, demanding_drive, condition, healthy)
     gap, current = truth.voltage_v - healthy.voltage_v, demanding_drive.current_a
     # Before the charger, which warms the pack.
@@ -188,7 +188,7 @@ def test_hysteresis_loop_has_its_width(pack: TwinPack) -> None:
     time_s = np.arange(pulse.size) * 0.5
     drive = Drive(time_s, pulse, np.full_like(time_s, 25.0), 25.0, 0.7, history=1.0)
     clean = simulate_truth(pack, drive)
-    condition = Faults.of([Fault("hysteresis", 1.0, {"reach": 0.03})])
+    condition = faults_by_id([Fault("hysteresis", 1.0, {"reach": 0.03})])
     gap = simulate_truth(pack, drive, condition, clean).voltage_v - clean.voltage_v
     assert gap[0] == pytest.approx(-1.0)
     assert gap[2399] == pytest.approx(-1.0)
@@ -214,7 +214,7 @@ def test_intermittent_is_active_for_its_share() -> None:
 
 
 def test_unreachable_gap_is_reported_as_limited(pack: TwinPack) -> None:
-    gentle = draw_drive(np.random.default_rng(1), pack, hours=0.5, ambient_c=25.0, start_soc=0.9)
+    gentle = draw_drive(np.random.default_rng(1), pack, hours=0.5, ambient_c=25.0, start_soc_pct=90)
     _, reached_v = scale_to_gap(
         pack, gentle, Fault("temperature_lag", 1.0), 5.0, simulate_truth(pack, gentle)
     )
@@ -226,4 +226,4 @@ def test_unknown_and_repeated_faults_are_refused() -> None:
     with pytest.raises(InputError, match="unknown effect"):
         fault_kind("gremlins")
     with pytest.raises(InputError, match="twice"):
-        Faults.of([Fault("capacity", 0.1), Fault("capacity", 0.2)])
+        faults_by_id([Fault("capacity", 0.1), Fault("capacity", 0.2)])

@@ -74,7 +74,7 @@ def test_an_injection_is_scaled_to_its_gap(log: Log, surrogate: TwinPack) -> Non
     assert rms(injected(log, surrogate, fault).gap_v) == pytest.approx(0.8, rel=0.04)
 
 
-def test_a_check_counts_what_was_found_at_each_size() -> None:
+def test_a_check_counts_what_was_found_at_each_size(surrogate: TwinPack) -> None:
     def finding(effect: str | None, floors: float, *, right: bool) -> gap_check.Finding:
         fault = "none" if effect is None else LIBRARY[effect].fault
         size = -2.0 * floors
@@ -93,7 +93,7 @@ def test_a_check_counts_what_was_found_at_each_size() -> None:
     assert ["current reading", "1/2, 1/1", "1/1, 1/1", "–"] in rows
     assert "first in 67 % of 3 injected effects" in gap_check.summary(result)
     with pytest.raises(InputError, match="3 healthy logs are too few"):
-        gap_check.own_pack([simulate(seed=1, hours=0.1).log] * 3, 60.0, 96)
+        next(gap_check.find([simulate(seed=1, hours=0.1).log] * 3, surrogate))
 
 
 def test_each_log_is_left_out_in_turn() -> None:

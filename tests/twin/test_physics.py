@@ -115,7 +115,7 @@ def test_seed_determines_the_simulation() -> None:
 
 def test_long_drive_takes_under_two_seconds(pack: TwinPack) -> None:
     rng = np.random.default_rng(2)
-    drive = draw_drive(rng, pack, hours=2.5, start_soc=1.0, end_soc=0.02, discharge=True)
+    drive = draw_drive(rng, pack, hours=2.5, start_soc_pct=100, end_soc_pct=2, discharge=True)
     began = time.process_time()
     simulate_truth(pack, drive)
     assert time.process_time() - began < 2.0  # usually about 0.1 s

@@ -18,19 +18,15 @@ from cangauge._text import NONE_KNOWN, number
 from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
 from cangauge.diagnosis.faults import FAULT
 from cangauge.errors import InputError
-from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kinds
-from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject, scale_injection
-from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.recording import record_drive
+from cangauge.extras.validation.twin.injection import inject, scale_injection
+from cangauge.extras.validation.twin.pack import TwinPack
+from cangauge.extras.validation.twin.simulation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 
 FLOORS: Final = (1.0, 2.0, 4.0)
 """Injected sizes [floors]."""
-LEAST_LOGS: Final = 4
-"""One is diagnosed, three are its references, as `gap` asks for."""
-SCHEMA: Final = 3
 _REACHED: Final = 0.8
 """Part of the wanted size below which the physical limits of an effect count as reached."""
 
@@ -57,34 +53,14 @@ class Finding:
     """Of the truth."""
 
 
-def own_pack(logs: Sequence[Log], capacity_ah: float, cells: int) -> TwinPack:
-    """Return one's own pack, whose physics is fitted to its healthy logs.
-
-    Raises
-    ------
-    InputError
-        If there are too few logs, or one has no SoC.
-    """
-    if len(logs) < LEAST_LOGS:
-        problem = f"{len(logs)} healthy logs are too few"
-        problem += ": one is diagnosed, the others are its references"
-        raise InputError(problem, field="--logs", cure=f"give at least {LEAST_LOGS}")
-    return fit_surrogate_pack(logs, capacity_ah=capacity_ah, cells=cells)
-
-
 def simulated_logs() -> tuple[list[Log], TwinPack]:
-    """Return a discharge and five drives of a simulated pack, and the pack."""
-    pack, rng = draw_pack(np.random.default_rng([1, 1])), np.random.default_rng([1, 2])
-    ambient_c = rng.uniform(8.0, 25.0)
-    full = draw_drive(
-        rng, pack, hours=2.0, ambient_c=ambient_c, start_soc=1.0, end_soc=0.05, discharge=True
-    )
-    drives = [
-        draw_drive(rng, pack, hours=0.8, ambient_c=ambient_c + away)
-        for away in np.linspace(-7.0, 7.0, 5)
+    """Return a discharge and five drives of a simulated pack from 9 to 23 °C, and the pack."""
+    runs = [simulate(seed=1, hours=2.0, ambient_c=16.0, discharge=True, name="drive_1")]
+    runs += [
+        simulate(seed=1, drive=k, hours=0.8, ambient_c=2.0 + 3.5 * k, name=f"drive_{k}")
+        for k in range(2, 7)
     ]
-    recorded = enumerate((full, *drives), 1)
-    return [record_drive(pack, drive, name=f"drive_{k}").log for k, drive in recorded], pack
+    return [run.recording.log for run in runs], runs[0].pack
 
 
 def find(logs: Sequence[Log], pack: TwinPack, at_most: int | None = None) -> Iterator[Finding]:
@@ -98,7 +74,16 @@ def find(logs: Sequence[Log], pack: TwinPack, at_most: int | None = None) -> Ite
         Its physics, for the injected effects.
     at_most : int, optional
         Leave out at most this many logs, evenly among them.
+
+    Raises
+    ------
+    InputError
+        If there are too few logs.
     """
+    if len(logs) < 4:  # `gap` asks for three references
+        problem = f"{len(logs)} healthy logs are too few"
+        problem += ": one is diagnosed, the others are its references"
+        raise InputError(problem, field="--logs", cure="give at least 4")
     count = min(at_most or len(logs), len(logs))
     for k in np.linspace(0.0, len(logs) - 1.0, count).round().astype(int).tolist():
         others = [*logs[:k], *logs[k + 1 :]]
@@ -136,41 +121,41 @@ def _cases(log: Log, pack: TwinPack, floor_v: float) -> Iterator[tuple[Log, Faul
             yield inject(log, [fault], pack).log, fault, reached_v / floor_v
 
 
-PER_LOG: Final = 1 + len(fault_kinds()) * len(FLOORS)
-"""Diagnoses of each log left out, at most."""
-
-
 def summarize(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return the result as one JSON object."""
     healthy = [item for item in findings if item.effect is None]
+    faulty = [item for item in findings if item.effect is not None]
     faults = []
     for fault in FAULTS:
-        found = [item for item in findings if item.fault == fault]
-        sizes = [_size(floors, found) for floors in FLOORS]
-        faults.append({"fault": fault, "sizes": [size for size in sizes if size["of"]]})
+        sizes = []
+        for floors in FLOORS:
+            lowest, highest = _REACHED * floors, floors / _REACHED
+            of = [x for x in faulty if x.fault == fault and lowest <= x.floors < highest]
+            if of:
+                sizes.append({"floors": floors, **_counts(of)})
+        faults.append({"fault": fault, "sizes": sizes})
     return {
-        "schema": SCHEMA,
+        "schema": 3,
         "healthy": {
             "logs": len(healthy),
             "alarms": sum(item.detected for item in healthy),
             "probability_none": float(np.mean([item.probability for item in healthy])),
         },
+        "injected": _counts(faulty),
         "faults": faults,
         "cases": [asdict(item) for item in findings],
     }
 
 
-def _size(floors: float, findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return how often a fault was found at a size at which it was injected."""
-    of = [item for item in findings if _REACHED * floors <= item.floors < floors / _REACHED]
+def _counts(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return how often an injected fault was found."""
     return {
-        "floors": floors,
-        "of": len(of),
-        "first": sum(item.first for item in of),
-        "stated": sum(item.stated for item in of),
-        "stated_right": sum(item.stated and item.first for item in of),
-        "detected": sum(item.detected for item in of),
-        "probability": sum(item.probability for item in of) / max(len(of), 1),
+        "of": len(findings),
+        "first": sum(item.first for item in findings),
+        "stated": sum(item.stated for item in findings),
+        "stated_right": sum(item.stated and item.first for item in findings),
+        "detected": sum(item.detected for item in findings),
+        "probability": float(np.mean([item.probability for item in findings])),
     }
 
 
@@ -187,14 +172,10 @@ def table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def summary(result: dict[str, Any]) -> str:
     """Return what this diagnosis would find, in a sentence or two."""
-    sizes = [each for item in result["faults"] for each in item["sizes"]]
-    of, first, stated, right = (
-        sum(each[name] for each in sizes) for name in ("of", "first", "stated", "stated_right")
-    )
-    shares = [number(100.0 * part / max(of, 1), 0, "%") for part in (first, stated)]
-    healthy = result["healthy"]
+    found, healthy = result["injected"], result["healthy"]
+    first, stated = (number(100.0 * found[x] / found["of"], 0, "%") for x in ("first", "stated"))
     return (
-        f"The right fault came first in {shares[0]} of {of} injected effects;"
-        f" one fault was stated in {shares[1]}, right in {right} of"
-        f" {stated}. False alarms: {healthy['alarms']} of {healthy['logs']} healthy logs."
+        f"The right fault came first in {first} of {found['of']} injected effects;"
+        f" one fault was stated in {stated}, right in {found['stated_right']} of"
+        f" {found['stated']}. False alarms: {healthy['alarms']} of {healthy['logs']} healthy logs."
     )

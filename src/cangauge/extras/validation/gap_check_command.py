@@ -55,6 +55,8 @@ def gap_check_command(
     `cangauge gap-check --at-most 2`
     """
     from cangauge.extras.validation import gap_check
+    from cangauge.extras.validation.twin.faults import fault_kinds
+    from cangauge.extras.validation.twin.injection import fit_surrogate_pack
 
     read = [reading.load(path) for path in logs or []]
     if not read:
@@ -63,9 +65,9 @@ def gap_check_command(
         problem, cure = "unknown capacity of the pack", "give it in Ah"
         raise InputError(problem, field="--capacity-ah", cure=cure)
     else:
-        healthy, pack = read, gap_check.own_pack(read, capacity_ah, cells)
-    diagnoses = min(at_most or len(healthy), len(healthy)) * gap_check.PER_LOG
-    note(f"at most {diagnoses} diagnoses, about half a second each")
+        healthy, pack = read, fit_surrogate_pack(read, capacity_ah=capacity_ah, cells=cells)
+    each = 1 + len(gap_check.FLOORS) * len(fault_kinds())
+    note(f"at most {each} diagnoses of each log left out, about half a second each")
     findings = []
     with progress() as show_line:
         for finding in gap_check.find(healthy, pack, at_most):

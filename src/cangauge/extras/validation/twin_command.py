@@ -111,7 +111,7 @@ def _show(result: dict[str, Any]) -> None:
         ["assumed initial SoC", f"{result['assumed_start_soc_pct']:.1f}", "%"],
         ["true SoC", f"{from_pct:.1f} → {to_pct:.1f}", "%"],
         ["temperature", f"{cold:.1f} … {warm:.1f}", "°C"],
-        ["sensor floor", f"{result['floor_sensor_v']:.3f}", "V"],
+        ["voltage sensor's error", f"{result['floor_sensor_v']:.3f}", "V"],
         ["gap", f"{result['gap_v']:.3f}", "V"],
     ]
     rows += [

@@ -70,8 +70,8 @@ def draw_drive(
     *,
     hours: float | None = None,
     ambient_c: float | None = None,
-    start_soc: float | None = None,
-    end_soc: float | None = None,
+    start_soc_pct: float | None = None,
+    end_soc_pct: float | None = None,
     speed_ms: FloatArray | None = None,
     discharge: bool = False,
 ) -> Drive:
@@ -82,17 +82,17 @@ def draw_drive(
     rng : Generator
     pack : TwinPack
     hours : float, optional
-        Duration [h], 0.05–12; by default 0.5–2.5. The drive ends early at `end_soc`.
+        Duration [h], 0.05–12; by default 0.5–2.5. The drive ends early at `end_soc_pct`.
     ambient_c : float, optional
         Initial ambient temperature [°C]; by default −10–35.
-    start_soc : float, optional
-        Initial SoC [-]; by default 0.45–1.
-    end_soc : float, optional
-        SoC at which the drive ends [-]; by default 0.05–0.2.
+    start_soc_pct : float, optional
+        Initial SoC [%]; by default 45–100.
+    end_soc_pct : float, optional
+        SoC at which the drive ends [%]; by default 5–20.
     speed_ms : array of shape (m,), optional
         Speed trace at 1 Hz [m/s], repeated as needed; by default a random one.
     discharge : bool
-        Scale the power so that the drive runs from `start_soc` to `end_soc` within `hours`.
+        Scale the power so that the drive runs from start to end within `hours`.
 
     Raises
     ------
@@ -100,18 +100,33 @@ def draw_drive(
         For a value out of range.
     """
     hours = float(rng.uniform(0.5, 2.5)) if hours is None else hours
-    ambient = float(rng.uniform(-10.0, 35.0)) if ambient_c is None else ambient_c
-    top = 1.0 - 0.55 * float(rng.beta(1.0, 1.6))
-    start = top if start_soc is None else start_soc
-    end = min(float(rng.uniform(0.05, 0.20)), 0.6 * start) if end_soc is None else end_soc
-    _check(hours, ambient, start, end)
+    ambient_c = float(rng.uniform(-10.0, 35.0)) if ambient_c is None else ambient_c
+    start = 1.0 - 0.55 * float(rng.beta(1.0, 1.6))
+    if start_soc_pct is not None:
+        start = start_soc_pct / 100.0
+    if end_soc_pct is None:
+        end = min(float(rng.uniform(0.05, 0.20)), 0.6 * start)
+    else:
+        end = end_soc_pct / 100.0
+    for name, value, low, high, unit in (
+        ("hours", hours, 0.05, 12.0, "h"),
+        ("ambient", ambient_c, -30.0, 50.0, "°C"),
+        ("start SoC", 100.0 * start, 3.0, 100.0, "%"),
+        ("end SoC", 100.0 * end, 1.0, 99.0, "%"),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"must lie within {low:g} … {high:g} {unit}", field=name, value=value)
+    if end >= start:
+        problem = f"the drive starts at {100.0 * start:g} %, at or below its end"
+        cure = "give a lower end or a higher start"
+        raise InputError(problem, field="end SoC", value=100.0 * end, cure=cure)
     seconds = int(hours * 3600.0)
     speed = _draw_speed(rng, seconds) if speed_ms is None else _given(speed_ms, seconds)
     is_free = speed_ms is None and not discharge
     if is_free:
         _park(rng, speed)
     # Auxiliary power, with a cabin heater in the cold.
-    heater_w = max(0.0, 18.0 - ambient) * float(rng.uniform(20.0, 110.0))
+    heater_w = max(0.0, 18.0 - ambient_c) * float(rng.uniform(20.0, 110.0))
     power = _battery_power(rng, speed, float(rng.uniform(250.0, 900.0)) + heater_w)
     if pack.energy_kwh < 15.0:  # a smaller car than that of 38 kWh which the road load describes
         power *= pack.energy_kwh / 38.0
@@ -131,29 +146,14 @@ def draw_drive(
     return Drive(
         time_s=time_s,
         current_a=current[:rows],
-        ambient_c=_weather(rng, time_s, ambient),
-        start_c=ambient + float(rng.normal(1.5, 2.0)),
+        ambient_c=_weather(rng, time_s, ambient_c),
+        start_c=ambient_c + float(rng.normal(1.5, 2.0)),
         start_soc=start,
         conditioning_w=float(pack.energy_kwh * rng.uniform(25.0, 130.0)) if is_conditioned else 0.0,
         target_c=float(rng.uniform(14.0, 26.0)),
         history=float(rng.choice((-1.0, -1.0, rng.uniform(-1.0, 1.0), 1.0))),
         seed=int(rng.integers(2**31)),
     )
-
-
-def _check(hours: float, ambient_c: float, start: float, end: float) -> None:
-    for name, value, low, high, unit in (
-        ("hours", hours, 0.05, 12.0, "h"),
-        ("ambient", ambient_c, -30.0, 50.0, "°C"),
-        ("start SoC", 100.0 * start, 3.0, 100.0, "%"),
-        ("end SoC", 100.0 * end, 1.0, 99.0, "%"),
-    ):
-        if not low <= value <= high:
-            raise InputError(f"must lie within {low:g} … {high:g} {unit}", field=name, value=value)
-    if end >= start:
-        problem = f"the drive starts at {100.0 * start:g} %, at or below its end"
-        cure = "give a lower end or a higher start"
-        raise InputError(problem, field="end SoC", value=100.0 * end, cure=cure)
 
 
 # --- Speed

@@ -18,8 +18,14 @@ from scipy.optimize import isotonic_regression
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import Drive
-from cangauge.extras.validation.twin.faults import Fault, Faults
-from cangauge.extras.validation.twin.pack import THERMAL_V, CellChemistry, Sensors, TwinPack
+from cangauge.extras.validation.twin.faults import Fault, faults_by_id
+from cangauge.extras.validation.twin.pack import (
+    THERMAL_V,
+    TYPICAL,
+    CellChemistry,
+    Sensors,
+    TwinPack,
+)
 from cangauge.extras.validation.twin.physics import lagged, simulate_truth
 from cangauge.extras.validation.twin.recording import (
     Recording,
@@ -36,10 +42,6 @@ _KNOTS: Final = np.array([0.0, 0.02, 0.05, *np.linspace(0.1, 0.9, 17), 0.95, 1.0
 """Knots of the surrogate's open-circuit voltage over the SoC [-]."""
 _LAGS_S: Final = (20.0, 200.0)
 """Lags of the current whose voltage is not taken for a slope over SoC [s]."""
-_LEAST_S: Final = 60.0
-"""Duration below which a log shows no fault of the pack [s]."""
-_RESOLUTIONS: Final = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001)
-"""Usual resolutions of a sensor."""
 
 
 def drive_of(log: Log, capacity_ah: float) -> Drive:
@@ -52,8 +54,8 @@ def drive_of(log: Log, capacity_ah: float) -> Drive:
     InputError
         If the log has no SoC at all, or is too short.
     """
-    if log.duration_s < _LEAST_S:
-        problem, source = f"shorter than {_LEAST_S:g} s", log.source or log.name
+    if log.duration_s < 60.0:
+        problem, source = "too short to show a fault: under 60 s", log.source or log.name
         raise InputError(problem, source=source, value=log.duration_s)
     step_s = float(np.clip(np.median(np.diff(log.time_s)), 0.1, 1.0))
     elapsed_s = log.time_s - log.time_s[0]
@@ -137,42 +139,30 @@ def fit_surrogate_pack(
     ohm = pack_ohm / cells
     energy_kwh = cells * 3.7 * capacity_ah / 1000.0
     heat_j_k = energy_kwh * 7000.0
+    first = logs[0]
     return TwinPack(
+        **TYPICAL,
         name=name,
         chemistry=CellChemistry.tabulated(name, _KNOTS, curve_v, 0.0, "nmc"),
         cells=cells,
         capacity_ah=capacity_ah,
-        weights=np.array([float(cells)]),
-        capacity_factor=np.ones(1),
-        resistance_factor=np.ones(1),
-        soc_shift=np.zeros(1),
+        groups=np.array([[float(cells)], [1.0], [1.0], [0.0]]),
         ohmic_ohm=0.55 * ohm,
-        ohmic_vogel_k=240.0,
         busbar_ohm=0.05 * pack_ohm,
         exchange_a=THERMAL_V / (0.40 * ohm),
-        exchange_activation_k=5200.0,
-        anodic=0.5,
-        double_layer_s=0.1,
         electrolyte_ohm=(0.08 * ohm, 0.07 * ohm),
-        electrolyte_tau_s=(20.0, 50.0),
         solid_swing=(0.012 / capacity_ah, 0.005 / capacity_ah, 0.003 / capacity_ah),
-        solid_tau_s=(60.0, 17.0, 5.0),
-        diffusion_activation_k=3000.0,
         core_j_k=0.75 * heat_j_k,
         surface_j_k=0.25 * heat_j_k,
         core_surface_w_k=energy_kwh * 7.0,
         surface_ambient_w_k=heat_j_k / 18000.0,
-        sensors=Sensors(
-            current_step_a=_resolution(logs[0].current_a),
-            voltage_step_v=_resolution(logs[0].voltage_v),
-            temperature_step_k=_resolution(logs[0].temperature_c),
-        ),
+        sensors=Sensors(*map(_resolution, (first.current_a, first.voltage_v, first.temperature_c))),
     )
 
 
 def _resolution(values: FloatArray) -> float:
     """Return the coarsest usual resolution of which all values are multiples, else 0."""
-    for step in _RESOLUTIONS:
+    for step in (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001):
         if np.all(np.abs(values / step - np.rint(values / step)) < 1e-5):
             return step
     return 0.0
@@ -194,7 +184,7 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> Recording:
     InputError
         If the log has no SoC or is too short, or a fault is unknown.
     """
-    present, sensors = Faults.of(faults), pack.sensors
+    present, sensors = faults_by_id(faults), pack.sensors
     drive = drive_of(log, pack.capacity_ah)
     elapsed_s: FloatArray = log.time_s - log.time_s[0]
     clean = simulate_truth(pack, drive)
@@ -206,21 +196,18 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> Recording:
     changed_v = log.voltage_v + at(read.truth.voltage_v - clean.voltage_v)
     changed_v = measured_voltage(pack, present, elapsed_s, changed_v)
     expected_v = log.voltage_v + at(read.expected_v - clean.voltage_v)
-    voltage_v = stepped(changed_v, sensors.voltage_step_v)
     changed_a = measured_current(present, elapsed_s, log.current_a)
     row, start_pct, _ = _start(log)
-    assumed_pct = np.where(np.arange(len(log)) == row, start_pct, np.nan)
     injected = replace(
         log,
         current_a=stepped(changed_a, sensors.current_step_a),
-        voltage_v=voltage_v,
+        voltage_v=stepped(changed_v, sensors.voltage_step_v),
         temperature_c=stepped(log.temperature_c + at(read.shift_k), sensors.temperature_step_k),
-        soc_pct=assumed_pct,
+        soc_pct=np.where(np.arange(len(log)) == row, start_pct, np.nan),
     )
     return Recording(
         log=injected,
         assumed_start_pct=start_pct,
-        sensor_error_v=voltage_v - changed_v,
         true_soc_pct=100.0 * (soc_of(log, pack.capacity_ah) + at(read.truth.soc - clean.soc)),
         expected_voltage_v=expected_v,
         gap_v=changed_v - expected_v,

@@ -34,6 +34,7 @@ def read_table(name: str) -> dict[str, Any]:
 _TABLE: Final = read_table("packs.toml")
 KINDS: Final = tuple(_TABLE["kinds"])
 CHEMISTRIES: Final = tuple(_TABLE["cells"])
+TYPICAL: Final[dict[str, Any]] = _TABLE["typical"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,27 +48,32 @@ class CellChemistry:
         Open-circuit voltage at 25 °C [V] over `GRID`, strictly rising.
     entropy_table_v_k : array of shape (m,)
         dU/dT over `GRID` [V/K].
+    empty_v : float
+        Voltage of the lowest cell at which the car stops [V].
     """
 
     name: str
     ocv_table_v: FloatArray
     entropy_table_v_k: FloatArray
+    empty_v: float
 
     @classmethod
     def tabulated(
-        cls, name: str, soc: ArrayLike, volts: FloatArray, bend_v: ArrayLike, entropy: str
+        cls, name: str, soc: ArrayLike, volts: FloatArray, bend_v: ArrayLike, like: str
     ) -> CellChemistry:
         """Return the cell of a table over the SoC, with a bend over `GRID` [V].
 
-        The table is extended beyond both ends, for weak and overcharged cells; `entropy` is the
-        chemistry of the tabulated dU/dT.
+        The table is extended beyond both ends, for weak and overcharged cells; `like` is the
+        chemistry whose entropy and empty voltage it has.
         """
         soc = np.concatenate(([-0.06, -0.03], soc, [1.04]))
         volts = np.concatenate((volts[0] - [1.35, 0.62], volts, [volts[-1] + 0.12]))
         table_v = np.maximum.accumulate(PchipInterpolator(soc, volts)(GRID) + bend_v)
-        soc_pct, entropy_mv_k = np.array(_TABLE["cells"][entropy]["entropy_mv_k"]).T
+        table = _TABLE["cells"][like]
+        soc_pct, entropy_mv_k = np.array(table["entropy_mv_k"]).T
         curve = PchipInterpolator(soc_pct / 100.0, entropy_mv_k * 1e-3)
-        return cls(name, table_v + 1e-6 * GRID, curve(np.clip(GRID, 0.0, 1.0)))
+        entropy_v_k = curve(np.clip(GRID, 0.0, 1.0))
+        return cls(name, table_v + 1e-6 * GRID, entropy_v_k, table["empty_v"])
 
     def ocv(self, soc: FloatArray) -> FloatArray:
         """Return the open-circuit voltage of one cell at 25 °C [V]; soc [-] of any shape."""
@@ -94,13 +100,13 @@ def chemistry(name: str, rng: np.random.Generator) -> CellChemistry:
     """
     if name not in CHEMISTRIES:
         raise InputError("unknown chemistry", value=name, cure=f"use {', '.join(CHEMISTRIES)}")
-    soc_pct, volts = np.array(_TABLE["cells"][name]["ocv_v"]).T
+    table = _TABLE["cells"][name]
+    soc_pct, volts = np.array(table["ocv_v"]).T
     waves = sum(
         rng.normal() / order * np.sin(order * np.pi * GRID + rng.uniform(0.0, 2.0 * np.pi))
         for order in (1, 2, 3)
     )
-    # A slow wave of 6 mV; smaller for the flat table of LFP, which must keep rising.
-    bend_v = waves * (0.0003 if name == "lfp" else 0.006)
+    bend_v = waves * table["bend_v"]
     return CellChemistry.tabulated(name, soc_pct / 100.0, volts, bend_v, name)
 
 
@@ -168,10 +174,9 @@ class TwinPack:
     chemistry : CellChemistry
     cells : int
     capacity_ah : float
-    weights : array of shape (g,)
-        Cells in each group.
-    capacity_factor, resistance_factor, soc_shift : array of shape (g,)
-        Deviation of each group from the mean cell [-].
+    groups : array of shape (4, g)
+        By group: number of cells, capacity and resistance relative to the mean cell [-], and its
+        SoC beyond the mean cell's [-].
     ohmic_ohm : float
     ohmic_vogel_k : float
         B of exp(B/(T − 170 K)), electrolyte conductivity (Vogel–Fulcher–Tammann) [K].
@@ -202,10 +207,7 @@ class TwinPack:
     chemistry: CellChemistry
     cells: int
     capacity_ah: float
-    weights: FloatArray
-    capacity_factor: FloatArray
-    resistance_factor: FloatArray
-    soc_shift: FloatArray
+    groups: FloatArray
     ohmic_ohm: float
     ohmic_vogel_k: float
     busbar_ohm: float
@@ -294,10 +296,14 @@ def draw_pack(
         chemistry=replace(cell, entropy_table_v_k=entropy * cell.entropy_table_v_k),
         cells=cells,
         capacity_ah=capacity_ah,
-        weights=np.array([0.1, 0.2, 0.4, 0.2, 0.1]) * cells,
-        capacity_factor=1.0 + rng.uniform(0.003, 0.012) * rng.permutation(quantiles),
-        resistance_factor=1.0 + rng.uniform(0.01, 0.05) * rng.permutation(quantiles),
-        soc_shift=rng.uniform(0.001, 0.006) * rng.permutation(quantiles),
+        groups=np.array(
+            [
+                np.array([0.1, 0.2, 0.4, 0.2, 0.1]) * cells,
+                1.0 + rng.uniform(0.003, 0.012) * rng.permutation(quantiles),
+                1.0 + rng.uniform(0.01, 0.05) * rng.permutation(quantiles),
+                rng.uniform(0.001, 0.006) * rng.permutation(quantiles),
+            ]
+        ),
         ohmic_ohm=ohmic,
         ohmic_vogel_k=rng.uniform(150.0, 320.0),
         busbar_ohm=cells * ohmic * rng.uniform(0.03, 0.15),

@@ -18,24 +18,11 @@ from scipy.signal import lfilter
 
 from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.drive import Drive
-from cangauge.extras.validation.twin.faults import HEALTHY, Fault, Faults
+from cangauge.extras.validation.twin.faults import HEALTHY, Fault, Faults, size_of
 from cangauge.extras.validation.twin.pack import GRID, KELVIN, TwinPack
 
 T0_K: Final = 298.15
 """Temperature of the parameters: 25 °C [K]."""
-_GLASS_K: Final = 230.0
-"""Temperature at which the fault `resistance_temperature` diverges [K]."""
-_VOGEL_K: Final = 170.0
-"""Temperature at which the electrolyte stops conducting [K]: Vogel–Fulcher–Tammann."""
-_GAS_OVER_FARADAY_V_K: Final = 8.617333e-5
-_REACHES: Final = np.array([0.06, 0.15, 0.35, 0.65, 1.0])
-"""Reaches of the stop operators of the hysteresis, relative to the fault's."""
-_COLE_SPREAD: Final = np.array([-1.6, -1.0, -0.5, 0.0, 0.5, 1.0, 1.6])
-"""Relaxations of a Cole–Cole element, in e-folds of its time constant."""
-_WARBURG_POLES: Final = np.arange(1.0, 12.0, 2.0) ** 2
-"""First six poles of a finite Warburg element, relative to the slowest."""
-_EMPTY_V: Final = {"lfp": 1.8}
-"""Voltage of the lowest cell at which the car stops [V]; of oxides 2.2 V."""
 TOLERANCE_K: Final = 0.05
 """Change of the core temperature at which the thermal iteration stops [K]."""
 
@@ -90,7 +77,7 @@ def simulate_truth(
         The same drive with other faults, as the start of the iteration. Within the tolerance its
         temperatures are kept, so that the voltages differ by the faults alone.
     """
-    insulation = faults.size("core_temperature")
+    insulation = size_of(faults, "core_temperature")
     if drive.recorded_c is not None:
         core = drive.recorded_c
         if insulation and near is not None:
@@ -122,9 +109,9 @@ def respond(
     if (load := faults.get("parasitic_switching")) is not None:
         I = I + load.size * load.is_active(time_s)
     cells, capacity, resistance, shift = _groups(pack, faults)
-    counted = np.where(I < 0.0, (1.0 - faults.size("coulombic_efficiency")) * I, I)
+    counted = np.where(I < 0.0, (1.0 - size_of(faults, "coulombic_efficiency")) * I, I)
     drawn = integral(counted, drive.step_s) / 3600.0 / pack.capacity_ah
-    start = drive.start_soc + faults.size("initial_soc") / 100.0
+    start = drive.start_soc + size_of(faults, "initial_soc") / 100.0
     z = (start + shift)[:, None] - drawn / capacity[:, None]
 
     electrolyte_v, reacting_a, swing = _relaxed(pack, drive, I, T)
@@ -132,8 +119,9 @@ def respond(
     reversible = dU_dT * (T - T0_K)
     U0 = cell.ocv(z) + reversible
 
-    stiff = np.exp(faults.size("resistance_temperature") * _over(T, _GLASS_K))
-    eta = _kinetics(pack, z, reacting_a, T, stiff * (1.0 + faults.size("charge_transfer")))
+    # This fault diverges at 230 K.
+    stiff = np.exp(size_of(faults, "resistance_temperature") * _over(T, 230.0))
+    eta = _kinetics(pack, z, reacting_a, T, stiff * (1.0 + size_of(faults, "charge_transfer")))
     R = pack.ohmic_ohm * ohmic_factor(pack, T) * stiff
     eta += R * I * (1.0 + _soc_rise(faults, z)) + electrolyte_v
     eta *= resistance[:, None]
@@ -144,11 +132,11 @@ def respond(
         drop = drop * (1.0 + dropout.size * dropout.is_active(time_s))
     drop = drop + _added_drop(drive, faults, I, T)
     open_v = cells @ U0
-    empty = np.flatnonzero(np.min(U0 - eta, axis=0) < _EMPTY_V.get(cell.name, 2.2))
+    empty = np.flatnonzero(np.min(U0 - eta, axis=0) < cell.empty_v)
     return Response(
         current_a=I,
         voltage_v=open_v - drop - _hysteresis(drive, faults, drawn),
-        soc=start - drawn / (1.0 - faults.size("capacity")),
+        soc=start - drawn / (1.0 - size_of(faults, "capacity")),
         equilibrium_v=open_v,
         heat_w=I * drop - I * T * (cells @ dU_dT),
         core_c=core_c,
@@ -166,23 +154,23 @@ def _over(T: FloatArray, pole_k: float) -> FloatArray:
 
 
 def ohmic_factor(pack: TwinPack, T: FloatArray) -> FloatArray:
-    """Return the ohmic resistance relative to 25 °C [-] (Vogel–Fulcher–Tammann)."""
-    return np.exp(pack.ohmic_vogel_k * _over(T, _VOGEL_K))
+    """Return the ohmic resistance relative to 25 °C [-] (Vogel–Fulcher–Tammann).
+
+    The electrolyte stops conducting at 170 K.
+    """
+    return np.exp(pack.ohmic_vogel_k * _over(T, 170.0))
 
 
-def _groups(
-    pack: TwinPack, faults: Faults
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return number of cells, capacity factor, resistance factor, start shift, shape (g,) each."""
-    groups = np.array([pack.weights, pack.capacity_factor, pack.resistance_factor, pack.soc_shift])
+def _groups(pack: TwinPack, faults: Faults) -> FloatArray:
+    """Return `groups` of a pack with its faults, shape (4, g)."""
+    groups = pack.groups.copy()
     if (weak := faults.get("weak_cell")) is not None:
         count, deficit = weak.full_shape["count"], weak.full_shape["deficit"]
         groups[0, groups.shape[1] // 2] -= count
         new = [count, 1.0 - weak.size, 1.0 + 0.5 * weak.size, -deficit * weak.size]
         groups = np.column_stack([groups, new])
-    groups[1] *= 1.0 - faults.size("capacity")
-    cells, capacity, resistance, shift = groups
-    return cells, capacity, resistance, shift
+    groups[1] *= 1.0 - size_of(faults, "capacity")
+    return groups
 
 
 def _relaxed(
@@ -210,7 +198,7 @@ def _kinetics(
     I0 = pack.exchange_a * 2.0 * np.sqrt(fill * (1.0 - fill)) * arrhenius / slowdown
     x = np.sinh(np.linspace(-6.0, 6.0, 1201)) / np.sinh(6.0) * 30.0
     ratio = np.exp(pack.anodic * x) - np.exp(-(1.0 - pack.anodic) * x)
-    return np.asarray(np.interp(I / I0, ratio, x) * _GAS_OVER_FARADAY_V_K * T)
+    return np.asarray(np.interp(I / I0, ratio, x) * 8.617333e-5 * T)  # R/F [V/K]
 
 
 def integral(signal: FloatArray, step_s: float) -> FloatArray:
@@ -326,7 +314,7 @@ def _soc_rise(faults: Faults, z: FloatArray) -> FloatArray | float:
 def _added_drop(drive: Drive, faults: Faults, I: FloatArray, T: FloatArray) -> FloatArray:
     """Return the voltage drop of faults around the cells [V], shape (n,)."""
     charging = 0.5 * (1.0 - I / np.hypot(I, 3.0))  # a contact that rectifies, smooth over 3 A
-    ohm = faults.size("resistance_asymmetry") * charging + faults.size("resistance_growth")
+    ohm = size_of(faults, "resistance_asymmetry") * charging + size_of(faults, "resistance_growth")
     if (step := faults.get("resistance_step")) is not None:
         ohm = ohm + step.size * (drive.time_s >= step.full_shape["at_s"])
     if (contact := faults.get("contact_flicker")) is not None:
@@ -347,24 +335,26 @@ def cole_cole(fault: Fault) -> tuple[FloatArray, FloatArray]:
     within 1.6 e-folds of τ0 (Cole and Cole 1941).
     """
     tau_s, alpha = fault.full_shape["tau_s"], fault.full_shape["alpha"]
-    weight = 1.0 / (np.cosh(alpha * _COLE_SPREAD) - np.cos((1.0 - alpha) * np.pi))
-    return fault.size * weight / weight.sum(), tau_s * np.exp(_COLE_SPREAD)
+    folds = np.array([-1.6, -1.0, -0.5, 0.0, 0.5, 1.0, 1.6])
+    weight = 1.0 / (np.cosh(alpha * folds) - np.cos((1.0 - alpha) * np.pi))
+    return fault.size * weight / weight.sum(), tau_s * np.exp(folds)
 
 
 def finite_warburg(fault: Fault) -> tuple[FloatArray, FloatArray]:
     """Return the first six poles [Ω, s] of a finite-length Warburg element R·tanh(√jωτ)/√jωτ."""
-    weight = 1.0 / _WARBURG_POLES
+    weight = 1.0 / np.arange(1.0, 12.0, 2.0) ** 2
     return fault.size * weight / weight.sum(), fault.full_shape["tau_s"] * weight
 
 
 def _hysteresis(drive: Drive, faults: Faults, drawn: FloatArray) -> FloatArray | float:
     """Return the voltage drop of hysteresis [V]: five stop operators on the charge.
 
-    Prandtl–Ishlinskii model: each operator follows the charge until it saturates at its reach.
+    Prandtl–Ishlinskii model: each operator follows the charge until it saturates at its reach, a
+    part of the fault's.
     """
     if (fault := faults.get("hysteresis")) is None:
         return 0.0
-    reach = fault.full_shape["reach"] * _REACHES
+    reach = fault.full_shape["reach"] * np.array([0.06, 0.15, 0.35, 0.65, 1.0])
     followed = [stopped(drawn, each, drive.history * each) / each for each in reach.tolist()]
     return np.asarray(fault.size * np.mean(followed, axis=0))
 

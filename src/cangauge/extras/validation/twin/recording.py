@@ -12,13 +12,19 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.drive import Drive
-from cangauge.extras.validation.twin.faults import HEALTHY, Fault, Faults, find_size
-from cangauge.extras.validation.twin.pack import KELVIN, Sensors, TwinPack
+from cangauge.extras.validation.twin.faults import (
+    HEALTHY,
+    Fault,
+    Faults,
+    faults_by_id,
+    find_size,
+    size_of,
+)
+from cangauge.extras.validation.twin.pack import Sensors, TwinPack
 from cangauge.extras.validation.twin.physics import (
     TOLERANCE_K,
     Response,
     lagged,
-    ohmic_factor,
     respond,
     simulate_truth,
     stopped,
@@ -36,8 +42,6 @@ class Recording:
         `soc_pct` holds the assumed initial SoC alone, NaN elsewhere.
     assumed_start_pct : float
         Assumed initial SoC [%].
-    sensor_error_v : array of shape (n,)
-        Voltage error of a perfect model by noise, quantization and the assumed initial SoC [V].
     true_soc_pct : array of shape (n,)
         True SoC, relative to the true mean capacity [%].
     expected_voltage_v : array of shape (n,)
@@ -48,7 +52,6 @@ class Recording:
 
     log: Log
     assumed_start_pct: float
-    sensor_error_v: FloatArray
     true_soc_pct: FloatArray
     expected_voltage_v: FloatArray
     gap_v: FloatArray
@@ -111,7 +114,7 @@ def scale_to_gap(
     least_s = min(900.0, 0.5 * float(drive.time_s[-1]))
 
     def gap_of(sized: Fault) -> float:
-        read = read_drive(pack, drive, Faults.of([sized]), healthy)
+        read = read_drive(pack, drive, faults_by_id([sized]), healthy)
         rows = read.truth.rows
         return rms(read.gap_v[:rows]) if rows * drive.step_s >= least_s else float("inf")
 
@@ -138,40 +141,40 @@ def record_drive(
     healthy : Response, optional
         The same drive without faults, if it is known already.
     """
-    sensors, rng, cell = pack.sensors, np.random.default_rng(drive.seed), pack.chemistry
-    read = read_drive(pack, drive, Faults.of(faults), healthy)
+    sensors, rng = pack.sensors, np.random.default_rng(drive.seed)
+    read = read_drive(pack, drive, faults_by_id(faults), healthy)
     time_s = _sampling_times(sensors, float(drive.time_s[read.truth.rows - 1]), rng)
 
     def at(signal: FloatArray) -> FloatArray:
         return np.interp(time_s, drive.time_s, signal)
 
-    def sampled(clean: FloatArray, noise: float, step: float) -> FloatArray:
-        return stepped(clean + rng.normal(0.0, noise, clean.size), step)
+    def sampled(signal: FloatArray, noise: float, step: float) -> FloatArray:
+        return stepped(at(signal) + rng.normal(0.0, noise, time_s.size), step)
 
-    clean_a, clean_v = at(read.current_a), at(read.voltage_v)
-    current_a = sampled(clean_a, sensors.current_noise_a, sensors.current_step_a)
-    voltage_v = sampled(clean_v, sensors.voltage_noise_v, sensors.voltage_step_v)
+    current_a = sampled(read.current_a, sensors.current_noise_a, sensors.current_step_a)
+    voltage_v = sampled(read.voltage_v, sensors.voltage_noise_v, sensors.voltage_step_v)
     step_k = sensors.temperature_step_k
-    temperature_c = sampled(at(read.temperature_c), 0.1 * step_k, step_k)
+    temperature_c = sampled(read.temperature_c, 0.1 * step_k, step_k)
     known_pct = 100.0 * drive.start_soc + rng.normal(0.0, sensors.start_soc_std_pct)
     assumed_pct = round(min(100.0, known_pct), 1)
     soc_pct = np.full(time_s.size, np.nan)
     soc_pct[0] = assumed_pct
-    soc = at(read.truth.soc)
-    assumed = soc + assumed_pct / 100.0 - drive.start_soc
-    ohm = pack.resistance_ohm * ohmic_factor(pack, at(read.truth.core_c) + KELVIN)
-    by_soc_v = pack.cells * (cell.ocv(assumed) - cell.ocv(soc))
+    log = Log(
+        time_s,
+        current_a,
+        voltage_v,
+        temperature_c,
+        soc_pct,
+        name=name,
+        temperature_source="pack",
+    )
     return Recording(
-        log=Log(
-            time_s, current_a, voltage_v, temperature_c, soc_pct, name=name,
-            temperature_source="pack",
-        ),
+        log=log,
         assumed_start_pct=assumed_pct,
-        sensor_error_v=voltage_v - clean_v - by_soc_v + ohm * (current_a - clean_a),
-        true_soc_pct=100.0 * soc,
+        true_soc_pct=100.0 * at(read.truth.soc),
         expected_voltage_v=at(read.expected_v),
         gap_v=at(read.gap_v),
-    )  # fmt: skip
+    )
 
 
 def _sampling_times(sensors: Sensors, end_s: float, rng: np.random.Generator) -> FloatArray:
@@ -200,12 +203,14 @@ def rms(values: FloatArray) -> float:
 
 def measured_current(faults: Faults, time_s: FloatArray, current_a: FloatArray) -> FloatArray:
     """Return the current that a sensor reports [A], shape (n,)."""
-    measured = np.interp(time_s - faults.size("time_skew"), time_s, current_a)
-    if remanence_a := faults.size("current_remanence"):
+    measured = np.interp(time_s - size_of(faults, "time_skew"), time_s, current_a)
+    if remanence_a := size_of(faults, "current_remanence"):
         reach = 0.25 * float(np.max(np.abs(measured)))
         measured = measured + remanence_a * stopped(measured, reach) / reach
-    measured = (1.0 + faults.size("current_gain")) * measured + faults.size("current_offset")
-    limit = (1.0 - faults.size("current_clipping")) * float(np.max(np.abs(measured)))
+    measured = (1.0 + size_of(faults, "current_gain")) * measured + size_of(
+        faults, "current_offset"
+    )
+    limit = (1.0 - size_of(faults, "current_clipping")) * float(np.max(np.abs(measured)))
     return np.clip(measured, -limit, limit)
 
 
@@ -213,7 +218,9 @@ def measured_voltage(
     pack: TwinPack, faults: Faults, time_s: FloatArray, voltage_v: FloatArray
 ) -> FloatArray:
     """Return the voltage that a sensor reports [V], shape (n,)."""
-    measured = (1.0 + faults.size("voltage_gain")) * voltage_v + faults.size("voltage_offset")
+    measured = (1.0 + size_of(faults, "voltage_gain")) * voltage_v + size_of(
+        faults, "voltage_offset"
+    )
     if (wave := faults.get("voltage_nonlinearity")) is not None:
         period_v = wave.full_shape["period_share"] * pack.nominal_v
         phase = 2.0 * np.pi * measured / period_v + wave.full_shape["phase"]
@@ -234,6 +241,6 @@ def measured_temperature(
     measured = lagged(surface_c, drive.step_s, pack.sensors.temperature_lag_s)
     # Two equal lags in series: a sensor in a pocket.
     for _ in range(2):
-        measured = lagged(measured, drive.step_s, 0.5 * faults.size("temperature_lag"))
-    held = faults.size("temperature_stuck") * (measured[0] - measured)
-    return np.asarray(measured + held + faults.size("temperature_offset"))
+        measured = lagged(measured, drive.step_s, 0.5 * size_of(faults, "temperature_lag"))
+    held = size_of(faults, "temperature_stuck") * (measured[0] - measured)
+    return np.asarray(measured + held + size_of(faults, "temperature_offset"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +16,6 @@ from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
 from cangauge.extras.validation.twin.physics import simulate_truth
 from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, scale_to_gap
 from cangauge.logs.log import Log
-
-_DEFAULT_GAP: Final = 0.003
-"""RMS gap of an effect without a size, relative to the nominal voltage [-]."""
-_DISCHARGE_HOURS: Final = 2.5
-_EMPTY_PCT: Final = 1.5
-"""SoC at which a full discharge ends [%]; `fit` takes 2 % and less as empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +43,7 @@ class Simulation:
     def to_dict(self) -> dict[str, Any]:
         """Return pack, ranges of the signals, RMS gap [V] and the effects with their sizes."""
         log, pack, recording = self.log, self.pack, self.recording
+        sensor_v = log.voltage_v - recording.expected_voltage_v - recording.gap_v
         return {
             "rows": len(log),
             "hours": log.duration_s / 3600.0,
@@ -59,7 +54,7 @@ class Simulation:
             "assumed_start_soc_pct": recording.assumed_start_pct,
             "true_soc_pct": [float(recording.true_soc_pct[0]), float(recording.true_soc_pct[-1])],
             "temperature_c": [float(log.temperature_c.min()), float(log.temperature_c.max())],
-            "floor_sensor_v": rms(recording.sensor_error_v),
+            "floor_sensor_v": rms(sensor_v),
             "gap_v": rms(recording.gap_v),
             "effects": [
                 {
@@ -132,17 +127,18 @@ def simulate(
     """
     require_number(seed, "seed")
     if discharge:
-        hours = _DISCHARGE_HOURS if hours is None else hours
+        hours = 2.5 if hours is None else hours
         start_soc_pct = 100.0 if start_soc_pct is None else start_soc_pct
-        end_soc_pct = _EMPTY_PCT if end_soc_pct is None else end_soc_pct
+        # `fit` takes 2 % and less as empty.
+        end_soc_pct = 1.5 if end_soc_pct is None else end_soc_pct
     drawn = draw_pack(np.random.default_rng([seed, 1]), pack, chemistry)
     load = draw_drive(
         np.random.default_rng([seed, 4, drive]),
         drawn,
         hours=hours,
         ambient_c=ambient_c,
-        start_soc=None if start_soc_pct is None else start_soc_pct / 100.0,
-        end_soc=None if end_soc_pct is None else end_soc_pct / 100.0,
+        start_soc_pct=start_soc_pct,
+        end_soc_pct=end_soc_pct,
         speed_ms=speed_ms,
         discharge=discharge,
     )
@@ -150,8 +146,7 @@ def simulate(
     faults: list[Fault] = []
     notes: list[str] = []
     for number, text in enumerate([effects] if isinstance(effects, str) else effects):
-        default_v = _DEFAULT_GAP * drawn.nominal_v
-        fault, gap_v = parse_effect(text, drawn, seed=seed + 7919 * number, default_gap_v=default_v)
+        fault, gap_v = parse_effect(text, drawn, seed=seed + 7919 * number)
         if gap_v is not None:
             fault, reached_v = scale_to_gap(drawn, load, fault, gap_v, healthy)
             if not is_reached(reached_v, gap_v):
