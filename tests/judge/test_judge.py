@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import sys
+import time
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -471,6 +472,24 @@ def unbroken(days: int) -> cangauge.Log:
     log = cangauge.Log(3600.0 * hours, amps, np.full(hours.size, 53.0), np.full(hours.size, 20.0))
     volts = cangauge.Model.prior("lfp", 16, 100.0).predict(log, initial_soc_pct=96.0).voltage_v
     return replace(log, voltage_v=volts, soc_pct=97.0 - drawn_ah(log))
+
+
+def cpu_s(days: int) -> float:
+    """Return the least time of two judgements of daily logs."""
+    log = unbroken(days)
+    day = log.time_s // 86400.0
+    logs = [log.rows(day == k) for k in range(days)]
+    times = []
+    for _ in range(2):
+        begun_s = time.thread_time()
+        cangauge.judge(logs, chemistry="lfp", cells=16, capacity_ah=100.0)
+        times.append(time.thread_time() - begun_s)
+    return min(times)
+
+
+def test_time_grows_with_the_number_of_logs() -> None:
+    cpu_s(2)  # what is loaded once
+    assert cpu_s(80) < 11.0 * cpu_s(10)
 
 
 def peak_bytes(log: cangauge.Log) -> int:

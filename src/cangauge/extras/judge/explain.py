@@ -7,7 +7,7 @@ faults that differs by one counts with its probability: nothing is certain becau
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from operator import attrgetter
 from typing import Final, NamedTuple
@@ -16,25 +16,16 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.special import logsumexp
 
-from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.judge.chain import Chain
 from cangauge.extras.judge.faults import FAULTS, Column, faults, healthy
 from cangauge.model.gaussian import GaussianPosterior, Rows
 
-JOINT_PCT: Final = 0.1
-"""Error of the SoC where one stretch continues another [%]."""
-FULL_STD_PCT: Final = 1.5
-"""Standard deviation of the SoC at the end of a full charge [%]: cut-off current and balancing."""
 VARIES: Final = 0.5
 """Part of the model's voltage errors that varies within a stretch [-]: they hold what differs from
 log to log too. Of 0.5, 1, 2 and 4 the evidence of every development chain chose the least."""
 BEYOND: Final = 3.0
 """Largest size of a fault that can explain an error [prior standard deviations]."""
-ITERATIONS: Final = 8
-"""Linearisations at most until no SoC moves by 0.1 %, each a part of the way, since the slope of a
-curve jumps between its features."""
-LEAST_SHARE: Final = 0.003
-"""Least probability of a set of faults that counts."""
 GAUGES: Final = np.array(
     [
         (0.05, 0.05, 0.1, 0.5, 0.3),
@@ -48,6 +39,9 @@ alone, of a random walk in an hour, of a steady drift over an hour, of the charg
 counts, and of the level between stretches [%]. From a pure counter (a BMW i3's) to a gauge that
 follows the voltage, which counts nothing."""
 
+Part = tuple[FloatArray, FloatArray, FloatArray]
+"""X, y and a root of the covariance of the noise of some rows."""
+
 
 class Fitted(NamedTuple):
     """Posterior of a set of faults."""
@@ -60,7 +54,7 @@ class Fitted(NamedTuple):
     """Whether the level of the last piece is free: then the gauge does not confirm itself."""
     faults: tuple[Column, ...]
     posterior: GaussianPosterior
-    """Of what is always there, then of the faults."""
+    """Of the faults, then of what is always there."""
     pack_pct: FloatArray
     """SoC of each block beside the model, …"""
     soc_pct: FloatArray
@@ -91,52 +85,49 @@ class Linearised:
         only: Sequence[int] | None = None,
         varies: float = VARIES,
     ) -> None:
-        self._chain, self._soc_pct, self._varies = chain, soc_pct, varies
+        self._chain = chain
         always, every = healthy(chain, known, soc_pct), faults(chain, soc_pct)
         self.faults = every if only is None else [every[k] for k in only]
         columns = [*always, *self.faults]
         self._n = len(always)
-        self._S, self._Y, self._V = (
+        self._std = np.array([each.std for each in columns])
+        self._S, self._Y, volts = (
             _sparse([getattr(each, of) for each in columns], soc_pct.size)
             for of in ("soc", "shown", "volts")
         )
-        self._std = np.array([each.std for each in columns])
         starts = [each.blocks.start for each in chain.stretches]
-        start_pct = (soc_pct + chain.blocks.drawn_pct)[starts][chain.blocks.stretch]
-        self._start_pct, self._counted_pct = start_pct, start_pct - chain.blocks.drawn_pct
+        self._start_pct = (soc_pct + chain.blocks.drawn_pct)[starts][chain.blocks.stretch]
+        self._counted_pct = self._start_pct - chain.blocks.drawn_pct
+        slope = chain.slope(soc_pct)
+        error_v = chain.blocks.voltage_v - chain.voltage_v(soc_pct)
+        error_v += slope * (soc_pct - self._counted_pct)
+        self._pack = _total(self._pack_parts(slope, error_v, volts, varies))
 
-    @cached_property
-    def pack_rows(self) -> Rows:
-        """Rows of the pack: those of the prior, of all voltages, full charges and joints."""
-        chain, counted_pct = self._chain, self._counted_pct
-        slope = chain.slope(self._soc_pct)
-        error_v = chain.blocks.voltage_v - chain.voltage_v(self._soc_pct)
-        error_v += slope * (self._soc_pct - counted_pct)
-        total = Rows.prior(self._std[: self._n], others=len(self.faults))
-        for at, root in chain.voltages(self._varies):
-            X = slope[at, None] * self._S[at].toarray() + self._V[at].toarray()
-            total += Rows.correlated(X, error_v[at], root)
+    def _pack_parts(
+        self, slope: FloatArray, error_v: FloatArray, volts: csr_array, varies: float
+    ) -> Iterator[Part]:
+        """Yield the prior, all voltages, full charges and joints."""
+        chain, S, counted_pct = self._chain, self._S, self._counted_pct
+        prior = np.eye(self._n, self._std.size)
+        yield prior, np.zeros(self._n), np.diag(self._std[: self._n])
+        for at, root in chain.voltages(varies):
+            yield slope[at, None] * S[at].toarray() + volts[at].toarray(), error_v[at], root
         full = np.flatnonzero(chain.is_full)
-        total += Rows.of(self._S[full].toarray(), 100.0 - counted_pct[full], FULL_STD_PCT)
+        # Standard deviation of the SoC at the end of a full charge: cut-off current and balancing.
+        yield S[full].toarray(), 100.0 - counted_pct[full], 1.5 * np.eye(full.size)
         later = [each for each in chain.stretches if each.continues]
         first = np.array([each.blocks.start for each in later], dtype=np.intp)
         ends = np.array([each.samples.start - 1 for each in later], dtype=np.intp)
         drawn_pct = chain.blocks.drawn_pct
         between_pct = drawn_pct[first] + chain.samples.drawn_pct[ends] - drawn_pct[first - 1]
         apart_pct = counted_pct[first - 1] - counted_pct[first] - between_pct
-        joints = (self._S[first] - self._S[first - 1]).toarray()
-        return total + Rows.of(joints, apart_pct, JOINT_PCT)
+        # Where one stretch continues another, the SoC is the same but for the resolution of a log.
+        yield (S[first] - S[first - 1]).toarray(), apart_pct, 0.1 * np.eye(first.size)
 
-    @cached_property
-    def rows(self) -> list[Rows]:
-        """Rows of pack and gauge at each of `GAUGES`."""
-        return [self.pack_rows + self.gauge_rows(k) for k in range(len(GAUGES))]
-
-    def gauge_rows(self, gauge: int) -> Rows:
-        """Return the rows of all counts at one of `GAUGES`."""
+    def _gauge_parts(self, gauge: int) -> Iterator[Part]:
+        """Yield all counts at one of `GAUGES`."""
         white, walk, drift, scale, level = GAUGES[gauge].tolist()
         chain, blocks = self._chain, self._chain.blocks
-        total = Rows(np.zeros((0, self._std.size + 1)), 0.0)
         for stretch in chain.stretches:
             at = np.flatnonzero(np.isfinite(blocks.count_pct[stretch.blocks]))
             at += stretch.blocks.start
@@ -147,9 +138,27 @@ class Linearised:
             covariance = walk**2 * np.minimum(hours[:, None], hours) + own * np.eye(at.size)
             covariance += np.outer(drift_pct, drift_pct) + np.outer(scale_pct, scale_pct) + level**2
             root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-            error_pct = blocks.count_pct[at] - self._start_pct[at]
-            total += Rows.correlated(self._Y[at].toarray(), error_pct, root)
-        return total
+            yield self._Y[at].toarray(), blocks.count_pct[at] - self._start_pct[at], root
+
+    def rows(self, gauge: int | None) -> Rows:
+        """Return the rows of the pack, and of all counts at one of `GAUGES`; None: of none."""
+        table, log_norm = self._pack
+        if gauge is not None:
+            counts, of_counts = _total(self._gauge_parts(gauge))
+            table, log_norm = table + counts, log_norm + of_counts
+        # Shapes of faults may be alike: a little of each square keeps the matrix positive.
+        table = table + np.diag(1e-11 * (1.0 + np.diag(table)))
+        return Rows(np.asarray(np.linalg.cholesky(table).T, dtype=np.float64), log_norm)
+
+    @cached_property
+    def of_gauges(self) -> list[Rows]:
+        """Rows at each of `GAUGES`."""
+        return [self.rows(k) for k in range(len(GAUGES))]
+
+    @cached_property
+    def _of_faults(self) -> list[Rows]:
+        """Rows of the faults at each of `GAUGES`."""
+        return [rows.eliminated(self._n) for rows in self.of_gauges]
 
     def log_weights(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Return ln of the weight of a set of faults, and with each other fault added to it.
@@ -166,35 +175,32 @@ class Linearised:
             [k for k, fault in enumerate(self.faults) if fault.place not in taken], dtype=np.intp
         )
         is_positive = np.array([not any(FAULTS[self.faults[k].fault].sides) for k in others], bool)
-        std = self._std[self._n + others]
+        std = self._std[self._n :]
+        prior = Rows.prior(std[list(chosen)], others=others.size)
         base, more = [], np.full((len(GAUGES), len(self.faults)), -np.inf)
-        for k, rows in enumerate(self.rows):
-            added = self._chosen(rows, chosen, others).added(self._n + len(chosen), std)
+        for k, rows in enumerate(self._of_faults):
+            given = rows.with_columns([*chosen, *others]) + prior
+            added = given.added(len(chosen), std[others])
             base.append(added.log_evidence + float(log_prior[list(chosen)].sum()))
-            size = added.mean / std
+            size = added.mean / std[others]
             is_sound = (np.abs(size) <= BEYOND) & ((size > 0.0) | ~is_positive)
             gain = np.where(is_sound, added.log_factor, -np.inf)
             more[k, others] = base[k] + gain + log_prior[others]
         return np.array(base), more
 
-    def _chosen(self, rows: Rows, chosen: Sequence[int], others: Sequence[int] | IntArray) -> Rows:
-        """Return the rows with a set of faults and its priors, then the columns of others."""
-        n, taken = self._n, self._n + np.array(chosen, dtype=np.intp)
-        rows = rows.with_columns([*range(n), *taken, *(n + k for k in others)])
-        prior = np.eye(taken.size, rows.table.shape[1] - 1, n)
-        return rows + Rows.of(prior, np.zeros(taken.size), self._std[taken])
-
     def fitted(
         self, chosen: Sequence[int], rows: Rows, share: float = 1.0, *, is_counter: bool = True
     ) -> Fitted:
         """Return the posterior of a set of faults of a probability."""
-        chain, zero = self._chain, self._chain.functions.number
-        posterior = self._chosen(rows, chosen, ()).posterior()
-        X = self._S[:, [*range(self._n), *(self._n + k for k in chosen)]]
+        chain, zero = self._chain, len(chosen) + self._chain.functions.number
+        of = [*(self._n + k for k in chosen), *range(self._n)]
+        prior = Rows.prior(self._std[of[: len(chosen)]], others=self._n)
+        posterior = (rows.with_columns(of) + prior).posterior()
+        X = self._S[:, of]
         pack_pct = self._counted_pct + X @ posterior.mean
-        root = posterior.root
         std_pct = [
-            np.linalg.norm(X[each.blocks] @ root + root[zero], axis=1) for each in chain.stretches
+            np.linalg.norm(X[each.blocks] @ posterior.root + posterior.root[zero], axis=1)
+            for each in chain.stretches
         ]
         return Fitted(
             share,
@@ -212,6 +218,23 @@ class Linearised:
         counts = np.flatnonzero(self._chain.piece >= 0)
         levels = [self.faults[k].shown for k in chosen if self.faults[k].piece >= 0]
         return not counts.size or any(np.asarray(shown)[counts[-1]] for shown in levels)
+
+
+def _total(parts: Iterable[Part]) -> tuple[FloatArray, float]:
+    """Return the Gram matrix of all whitened rows, y as its last column, and their `log_norm`.
+
+    Within a stretch most columns are 0 or alike.
+    """
+    total, log_norm = np.zeros(()), 0.0
+    for X, y, root in parts:
+        first = dict[bytes, int]()
+        alike = [first.setdefault(column.tobytes(), k) for k, column in enumerate(X.T)]
+        distinct, place = np.unique(alike, return_inverse=True)
+        rows = Rows.correlated(X[:, distinct], y, root)
+        every = [*place.tolist(), -1]
+        total = total + (rows.table.T @ rows.table)[np.ix_(every, every)]
+        log_norm += rows.log_norm
+    return total, log_norm
 
 
 def _sparse(columns: Sequence[FloatArray | BoolArray | float], size: int) -> csr_array:
@@ -247,10 +270,12 @@ def explain(chain: Chain, known: Mapping[str, float]) -> list[Fitted]:
         some = {chosen: each for chosen, each in weights.items() if at.is_free(chosen) == is_free}
         most = max((float(each.max()) for each in some.values()), default=0.0)
         for chosen, of_gauges in some.items():
-            for gauge in np.flatnonzero(of_gauges >= most + np.log(LEAST_SHARE)).tolist():
+            for gauge in np.flatnonzero(of_gauges >= most + np.log(0.003)).tolist():
                 share = float(np.exp(of_gauges[gauge] - log_total))
                 is_counter = gauge < len(GAUGES) - 1
-                fits.append(at.fitted(sorted(chosen), at.rows[gauge], share, is_counter=is_counter))
+                fits.append(
+                    at.fitted(sorted(chosen), at.of_gauges[gauge], share, is_counter=is_counter)
+                )
     return sorted(fits, key=attrgetter("share"), reverse=True)
 
 
@@ -280,10 +305,9 @@ def _settled(
     With the gauge withheld all of the voltage's errors may vary.
     """
     varies = 1.0 if gauge is None else VARIES
-    for _ in range(ITERATIONS):
+    for _ in range(8):  # a part of the way each, as the slope jumps between features of a curve
         at = Linearised(chain, known, soc_pct, chosen, varies)
-        rows = at.pack_rows if gauge is None else at.pack_rows + at.gauge_rows(gauge)
-        found = at.fitted(range(len(chosen)), rows).pack_pct
+        found = at.fitted(range(len(chosen)), at.rows(gauge)).pack_pct
         step = np.clip(found, -3.0, 103.0) - soc_pct
         if np.abs(step).max() < 0.1:
             break

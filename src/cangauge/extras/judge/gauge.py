@@ -106,9 +106,10 @@ def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, least: floa
     first = np.flatnonzero(np.diff(window, prepend=-1.0))
     if first.size < 3:
         return []
+    low, high = (np.diff(first, append=known.size) - 1) // 2, np.diff(first, append=known.size) // 2
     level, value = (
-        np.array([np.median(part) for part in np.split(of[known], first[1:])])
-        for of in (count, shown)
+        0.5 * (inside[first + low] + inside[first + high])
+        for inside in (of[known][np.lexsort([of[known], window])] for of in (count, shown))
     )
     # Over two windows, so that a jump of a minute counts whole.
     change = level[2:] - level[:-2]

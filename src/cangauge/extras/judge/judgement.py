@@ -280,8 +280,8 @@ def _faults(chain: Chain, fits: Sequence[Fitted]) -> list[FoundFault]:
     shapes = dict[tuple[str, int, int], list[tuple[Column, float, float, float]]]()
     for fit in fits:
         number_of = len(fit.faults)
-        sizes = fit.posterior.mean[-number_of:] if number_of else ()
-        stds = np.linalg.norm(fit.posterior.root[-number_of:], axis=1) if number_of else ()
+        sizes = fit.posterior.mean[:number_of]
+        stds = np.linalg.norm(fit.posterior.root[:number_of], axis=1)
         for column, size, std in zip(fit.faults, sizes, stds, strict=True):
             is_possible = fit.is_counter or not FAULTS[column.fault].is_of_count
             share = fit.share if is_possible else 0.0
@@ -324,10 +324,10 @@ def narrowed(judgement: Judgement) -> Model:
         problem = "the model states no error of its curve that logs could narrow"
         raise InputError(problem, field="--output", cure="make the model by `cangauge fit`")
     curve, loads = np.array(fields.curve_v).T, np.array(fields.load).T
-    number_of = curve.shape[1]
-    learned = posterior.mean[:number_of]
-    covariance = posterior.covariance[:number_of, :number_of]
-    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(number_of))
+    first = len(judgement.fits[0].faults)
+    of = slice(first, first + curve.shape[1])
+    learned, covariance = posterior.mean[of], posterior.covariance[of, of]
+    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(learned.size))
     functions = FunctionFields(
         soc_pct=fields.soc_pct, curve_v=(curve @ root).T.tolist(), load=(loads @ root).T.tolist()
     )
