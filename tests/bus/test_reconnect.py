@@ -102,11 +102,11 @@ def test_a_lost_bus_is_reopened_with_its_filters(error: BaseException, log: BusL
 
 def test_a_failed_send_is_a_loss_and_later_frames_are_counted(log: BusLog) -> None:
     port = port_on(Opener(BrokenBus([], sending=network_down()), missing()))
-    port.post(FRAME)
+    port.post(FRAME, 1.0)
     assert (port.losses, port.unsent) == (1, 1)
     began_s = time.monotonic()
     for _ in range(1000):
-        port.post(FRAME)
+        port.post(FRAME, 1.0)
     assert time.monotonic() - began_s < 0.1
     assert port.unsent == 1001
     assert "sending failed" in log.lines[0]
@@ -139,7 +139,7 @@ def test_a_bus_that_is_missing_at_the_start(log: BusLog) -> None:
     port = port_on(Opener(missing(), missing(), BrokenBus([FRAME])), wait=True)
     assert port.is_away
     assert port.trouble.startswith("bus away for ")
-    port.post(FRAME)
+    port.post(FRAME, 1.0)
     received = pump(port, 2.0, until=lambda: not port.is_away)
     received += pump(port, 0.1)
     assert len(received) == 1
@@ -179,7 +179,6 @@ def test_bus_off_and_its_end_are_logged(log: BusLog) -> None:
     port = port_on(Opener(bus))
     assert pump(port, 0.1) == []
     assert port.error_frames == 2
-    assert port.error_kinds == {"bus_error": 1, "bus_off": 1}
     assert port.is_off
     assert port.trouble == "bus-off"
     assert "restart-ms" in log.lines[0]

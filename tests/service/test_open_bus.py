@@ -124,8 +124,8 @@ def test_driver_errors_are_explained(
 
 
 def test_bus_options_get_their_types() -> None:
-    assert parse_bus_options(["bitrate=500000", "fd=True", "x=0x10", "f=0.5", "name=a=b"]) == {
-        "bitrate": 500000, "fd": True, "x": 16, "f": 0.5, "name": "a=b",
+    assert parse_bus_options(["bitrate=500000", "fd=True", "x=10", "f=0.5", "name=a=b"]) == {
+        "bitrate": 500000, "fd": True, "x": 10, "f": 0.5, "name": "a=b",
     }  # fmt: skip
     for text in ("bitrate", "=5", "a b=3"):
         with pytest.raises(InputError, match="K=V"):

@@ -11,17 +11,21 @@ from __future__ import annotations
 import errno
 import ipaddress
 import os
+import select
 import socket
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Final, Literal
 
 import can
+from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.socketcan.socketcan import capture_message
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.typechecking import CanFilter
+from can.util import cast_from_string
 
 from cangauge.errors import InputError
 
@@ -39,6 +43,8 @@ RECEIVE_BUFFER_BYTES: Final = 16 << 20
 """Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
 CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
+_BUFFER_OPTIONS: Final = (socket.SO_RCVBUF, *([33] if sys.platform == "linux" else []))
+"""Options that set the size of the receive buffer: the second is SO_RCVBUFFORCE."""
 _OWN_GROUP_ONLY: Final = {
     socket.AF_INET: (socket.IPPROTO_IP, 49),
     socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
@@ -166,18 +172,14 @@ def is_multicast(channel: str) -> bool:
 
 
 def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
-    """Parse `K=V` texts; whole numbers, decimals, true and false get their type."""
+    """Parse `K=V` texts; numbers, true and false get their type, as in python-can's options."""
     options: dict[str, BusOption] = {}
     for text in given:
         key, equals, value = text.partition("=")
         if not equals or not key.isidentifier():
             problem, cure = "not of the form K=V", "e.g. bitrate=500000"
             raise InputError(problem, field="--bus-option", value=text, cure=cure)
-        options[key] = {"true": True, "false": False}.get(value.lower(), value)
-        if options[key] is value:
-            for kind in (float, partial(int, base=0)):
-                with suppress(ValueError):
-                    options[key] = kind(value)
+        options[key] = cast_from_string(value)
     return options
 
 
@@ -201,16 +203,19 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
         bus: can.BusABC
         if address.interface == "udp_multicast":
             bus = CheckedUdpBus(channel, local_only=address.local_only, **arguments)
+        elif address.interface == "socketcan":
+            bus = PolledSocketcanBus(address.channel, **arguments)
         else:
             arguments |= {"interface": address.interface, "ignore_config": True}
             bus = can.Bus(channel=channel, **arguments)
     except _DRIVER_ERRORS as error:
         raise _refusal(address, error) from error
     if address.interface in _ON_SOCKETS and sys.platform != "win32":
-        _widen_receive_buffer(bus)
-    if address.interface == "socketcan":
-        # SocketCAN opens an interface that is down; the error comes with the next call.
-        with socket.socket(fileno=os.dup(bus.fileno())) as own:
+        with socket_of(bus) as own:
+            for option in _BUFFER_OPTIONS:
+                with suppress(OSError):  # the system may refuse, or cap the size silently
+                    own.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
+            # SocketCAN opens an interface that is down; the error comes with the next call.
             code = own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if code:
             bus.shutdown()
@@ -219,12 +224,9 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
     return bus
 
 
-def _widen_receive_buffer(bus: can.BusABC) -> None:
-    # A duplicate of the driver's private socket; the system may refuse, or cap the size silently.
-    forced = [33] if sys.platform == "linux" else []  # SO_RCVBUFFORCE
-    for option in (socket.SO_RCVBUF, *forced):
-        with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
-            own.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
+def socket_of(bus: can.BusABC) -> socket.socket:
+    """Return a duplicate of a driver's private socket, to be closed; OSError without one."""
+    return socket.socket(fileno=os.dup(bus.fileno()))
 
 
 def _refusal(address: BusAddress, error: BaseException) -> InputError:
@@ -275,6 +277,31 @@ def _cure_of_missing(channel: str) -> str:
     with suppress(OSError):
         names = [name for _, name in socket.if_nameindex() if "can" in name]
     return f"check adapter and name; this machine has {', '.join(names) or 'no CAN interface'}"
+
+
+class PolledSocketcanBus(SocketcanBus):
+    """python-can's bus, read with one system call per pending frame where python-can needs three.
+
+    Its waits use the monotonic clock, whereas python-can's follow a clock that can be set.
+    """
+
+    def __init__(self, channel: str, **kwargs: Any) -> None:
+        super().__init__(channel, **kwargs)
+        self.socket.setblocking(False)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame; None if none came in time [s]."""
+        if timeout:
+            select.select([self.socket], [], [], timeout)
+        try:
+            message = capture_message(self.socket)
+        except can.CanOperationError as error:
+            if error.error_code == errno.EAGAIN:
+                return None
+            raise
+        if message is not None:
+            message.channel = self.channel
+        return message
 
 
 # --- UDP multicast. Anybody who reaches the port may send: the socket is bound to all network
@@ -332,25 +359,28 @@ class CheckedUdpBus(UdpMulticastBus):
         super().__init__(*args, **kwargs)
         if sys.platform == "linux":
             # Kernels before 4.20 have none for IPv6.
-            with suppress(OSError), socket.socket(fileno=os.dup(self.fileno())) as own:
+            with suppress(OSError), socket_of(self) as own:
                 own.setsockopt(*_OWN_GROUP_ONLY[own.family], 0)
 
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame; None if none came in time [s].
+
+        A flood of other packets does not hold the caller for longer.
+        """
+        wait_s = timeout or 0.0
+        until_s = time.monotonic() + wait_s
         carries_fd = self.protocol is can.CanProtocol.CAN_FD
-        # Until a frame passes or none is pending, so that no frame means an empty queue; a flood of
-        # other frames must not hold the caller.
         for _ in range(MOST_UNWANTED):
-            received = self._multicast.recv(timeout)
+            received = self._multicast.recv(wait_s)
             if not received:
                 break
             packet, sender, stamp_s = received
-            timeout = 0.0
-            if self._local_only and not self._is_local(str(sender[0])):
-                continue
-            message = message_of(packet, stamp_s)
-            if (carries_fd or not message.is_fd) and self._matches_filters(message):
-                return message, True
-        return None, False
+            if not self._local_only or self._is_local(str(sender[0])):
+                message = message_of(packet, stamp_s)
+                if (carries_fd or not message.is_fd) and self._matches_filters(message):
+                    return message
+            wait_s = max(until_s - time.monotonic(), 0.0)
+        return None
 
     def _is_local(self, host: str) -> bool:
         if host != self._local_host and _is_own_address(host):

@@ -12,7 +12,7 @@ import can
 from can.typechecking import CanFilter
 
 from cangauge._logging import emit
-from cangauge.bus.connection import AT_ONCE, SEND_WITHIN_S, BusConnection, BusError
+from cangauge.bus.connection import AT_ONCE, BusConnection, BusError
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.errors import InputError
 
@@ -70,7 +70,7 @@ class ReconnectingBus(BusConnection):
         self._is_closed = True
         super().close()
 
-    def post(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> None:
+    def post(self, message: can.Message, within_s: float) -> None:
         """Send a frame without waiting; drop it while the bus is away."""
         if self._bus is None:
             self.unsent += 1
