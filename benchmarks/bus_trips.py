@@ -136,7 +136,7 @@ def compare(log: Log, vehicle: Vehicle, model: Model, address: BusAddress) -> Co
     return Comparison(
         trip=log.name,
         samples=len(rows),
-        lost=len(log) - len(rows) + pipeline.counts.lost,
+        lost=len(log) - len(rows) + pipeline.counts["lost"],
         seconds=seconds,
         difference_pct=largest("soc_pct"),
         bound_pct=bound["ekf"],

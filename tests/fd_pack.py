@@ -57,7 +57,7 @@ def estimates_from_64_bytes(address: BusAddress, folder: Path) -> None:
         sample = live.pipeline.latest_sample
     assert sample is not None
     assert (sample.current_a, sample.voltage_v) == pytest.approx((-19.6, 372.97))
-    assert live.pipeline.counts.lost == 0
+    assert live.pipeline.counts["lost"] == 0
     recorded = estimate_capture(path, car, leaf_model(), PipelineSettings().estimator)
     # The filter knows no SoC before its first block: the inverse of each row is compared.
     newton_pct = [estimate.soc_newton_pct for _, estimate in live.rows]

@@ -69,7 +69,7 @@ def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) 
     with virtual_service(f"{preset}{method}", settings, vehicle=vehicle) as service:
         state = play_log(f"{preset}{method}", 200.0, MAX, preset)
     assert state.acknowledged == state.samples == len(log) == len(service.rows)
-    assert service.pipeline.counts.lost == 0
+    assert service.pipeline.counts["lost"] == 0
     offline = run_estimator(samples_of(log), model, estimator).soc_pct
     live = np.array([estimate.soc_pct for _, estimate in service.rows])
     bound = quantization_bound(vehicle, model, log)
@@ -183,7 +183,7 @@ def test_lost_frames_are_counted_and_the_replay_goes_on() -> None:
         port = BusConnection(bus, NOWHERE)  # type: ignore[arg-type] # has what is used of a bus
         with port:
             state = play(port, source, **MAX, stop=never)
-        assert service.pipeline.counts.lost > 0
+        assert service.pipeline.counts["lost"] > 0
     assert state.acknowledged is not None
     assert 0 < state.lost <= 4
     assert state.acknowledged + state.lost == state.samples == 300
@@ -291,7 +291,7 @@ def test_a_loop_runs_until_stopped() -> None:
         settings = {"speed": math.inf, "loop": True}
         state = play(port, source, **settings, stop=lambda: service.pipeline.samples >= 220)
         assert state.samples >= 220
-        assert service.pipeline.counts.beginnings == 0
+        assert service.pipeline.counts["beginnings"] == 0
         assert service.rows[219][0] == pytest.approx(21.9)
 
 

@@ -271,7 +271,7 @@ def test_two_services_with_the_same_ids_notice_each_other() -> None:
         assert waits(lambda: bool(one.pipeline.published.reasons & Reason.DUPLICATE_SENDER))
     for service in (one, two):
         assert service.monitor.foreign >= 3
-        assert service.pipeline.counts.frames == 0  # they are not input
+        assert service.pipeline.counts["frames"] == 0  # they are not input
 
 
 @pytest.mark.parametrize("echoes", [False, True])
@@ -322,4 +322,4 @@ def test_false_frames_do_not_move_the_soc() -> None:
     assert max(abs(each.soc_pct - 79.0) for each in during) < 1.0
     assert all(abs(each.soc_pct - 77.2) < 3.0 * each.soc_std_pct for each in after)
     assert max(each.soc_std_pct for each in after) > 1.5 * during[0].soc_std_pct
-    assert pipeline.counts.samples < 2200
+    assert pipeline.counts["samples"] < 2200

@@ -69,7 +69,7 @@ def test_no_estimate_before_the_first_replay_clock(log: Log) -> None:
     pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
     frames = frames_of(log, vehicle)[:50]
     assert estimates(pipeline, frames) == []
-    assert pipeline.counts.untimed == 50
+    assert pipeline.counts["untimed"] == 50
 
 
 def test_samples_of_a_replay_are_acknowledged_while_they_come(log: Log) -> None:
@@ -77,7 +77,7 @@ def test_samples_of_a_replay_are_acknowledged_while_they_come(log: Log) -> None:
     pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
     reader, told = SocReader(), [0]
     for frame in with_clock(frames_of(log.rows(slice(0, 100)), vehicle)):
-        for sent in pipeline.acknowledgement(pipeline.latest) if pipeline.handle(frame) else []:
+        for sent in pipeline.replay_frames(pipeline.latest) if pipeline.handle(frame) else []:
             name, content = reader.read(sent)
             told += [content["samples"]] if name == "soc_detail" else []
         assert pipeline.samples - told[-1] < ACKNOWLEDGE_EVERY

@@ -56,7 +56,7 @@ def test_real_leaf_captures_raise_no_alarm(shared_data: Path, name: str) -> None
     estimates = [pipeline.latest for frame in frames if pipeline.handle(frame)]
     assert not any(each.reasons & ALARMS for each in estimates)
     counts = pipeline.counts
-    assert (counts.implausible, counts.stuck, counts.held_back, counts.repeated) == (0, 0, 0, 0)
+    assert not any(counts[name] for name in ("implausible", "stuck", "held_back", "repeated"))
     assert not pipeline.estimate_now().reasons & (
         ALARMS | Reason.VOLTAGE_MISSING | Reason.TEMPERATURE_MISSING
     )
@@ -86,7 +86,7 @@ def test_replayed_trips_raise_no_alarm_and_match_offline(
         frames = encoder.encode(sample)
         estimates += [pipeline.latest for frame in frames if pipeline.handle(frame)]
     counts = pipeline.counts
-    assert (counts.implausible, counts.stuck, counts.held_back) == (0, 0, 0)
+    assert not any(counts[name] for name in ("implausible", "stuck", "held_back"))
     settings = replace(START, temperature_source=vehicle.temperature_source)
     offline = run_estimator(samples_of(quantized(encoder.vehicle, log)), leaf_model(), settings)
     assert [each.soc_pct for each in estimates] == offline.soc_pct.tolist()
@@ -119,5 +119,5 @@ def test_real_frames_damaged_for_a_second_are_refused(shared_data: Path) -> None
     )
     after = [each for at_s, each in published.items() if at_s > 1.05]
     assert not any(each.reasons & ALARMS for each in after)
-    assert pipeline.counts.crc_errors >= 99
+    assert pipeline.counts["crc_errors"] >= 99
     assert pipeline.latest.soc_pct == pytest.approx(whole.latest.soc_pct, abs=0.01)

@@ -132,12 +132,12 @@ def test_another_name_of_the_model_keeps_the_signals_health(car: Car) -> None:
 
 
 def test_a_reload_changes_the_vehicle_and_keeps_counts(car: Car) -> None:
-    frames, wanted = car.pipeline.counts.frames, car.pipeline.decoder.statistics.wanted
+    frames, wanted = car.pipeline.counts["frames"], car.pipeline.decoder.statistics.wanted
     assert car.reload('vehicle = "leaf_aze0"\n')
     assert car.pipeline.decoder.statistics.wanted == wanted > 0
     car.drive(1000, 1100)  # the frames of the other car: not wanted now
     assert car.pipeline.samples == 1000
-    assert car.pipeline.counts.frames > frames
+    assert car.pipeline.counts["frames"] > frames
     assert 0x1DB in [each["can_id"] for each in car.pipeline.filters]
     assert car.reload("")
     car.drive(1100, 1110)

@@ -193,7 +193,7 @@ def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) ->
     machine.wall_s += 300.0  # which has no say
     assert play(machine.start(), DRIVE[1000:]) == whole
     assert play(machine.start(), DRIVE[:100]).samples == 100
-    assert machine.pipeline.counts.beginnings == 1
+    assert machine.pipeline.counts["beginnings"] == 1
 
 
 # --- Refused

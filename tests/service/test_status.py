@@ -56,7 +56,7 @@ def test_a_status_is_plain_json_of_what_the_loop_counted(watched: Watched) -> No
     assert status["samples"] == 900
     assert status["status"] == "valid"
     assert status["estimate"]["soc_pct"] == watched.pipeline.latest.soc_pct
-    frames = watched.pipeline.counts.frames
+    frames = watched.pipeline.counts["frames"]
     assert status["frames"] == {"received": frames, "wanted": frames, "used": frames, "lost": 0}
     counts = {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4, "foreign": 0}
     assert status["bus_counts"] == counts

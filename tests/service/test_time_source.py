@@ -121,5 +121,5 @@ def test_the_service_counts_what_a_replay_lost() -> None:
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), settings)
     for frame in replayed(500)[:1] + replayed(500)[-1:]:
         pipeline.handle(frame)
-    assert pipeline.counts.lost == 500
-    assert pipeline.counts.untimed == 0
+    assert pipeline.counts["lost"] == 500
+    assert pipeline.counts["untimed"] == 0

@@ -122,7 +122,7 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     with Recorder(path) as recorder, service("leaf_aze0", settings, recorder) as live:
         state = play(replay_port, LogSource(log, vehicle), **MAX, stop=never)
     assert state.acknowledged == len(live.rows) == len(log)
-    assert live.pipeline.counts.lost == live.pipeline.counts.crc_errors == 0
+    assert live.pipeline.counts["lost"] == live.pipeline.counts["crc_errors"] == 0
     soc = np.array([estimate.soc_pct for _, estimate in live.rows])
     residual = np.array([estimate.residual_v for _, estimate in live.rows])
     offline = run_estimator(samples_of(log), leaf_model(), estimator)

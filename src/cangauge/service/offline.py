@@ -7,9 +7,9 @@ same bit for bit.
 from __future__ import annotations
 
 import time
-from array import array
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from os import PathLike
 from typing import Any, Final, Literal, cast
 
@@ -38,7 +38,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import CellColumns
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
-from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.settings import REPLAY_CLOCK_ID, FrameIds, TimeSourceName
 from cangauge.types import Estimate, Reason, Sample, reason_name, reason_sentences
 
@@ -95,8 +95,8 @@ class RecordedEstimate:
     origin : {"given", "log", "voltage"}
         Source of the initial SoC.
     time_source : {"receive", "replay-clock"}, optional
-    counts : FrameCounts, optional
-        Source of bus time, and frames and values by outcome, of a capture.
+    counts : dict, optional
+        Source of bus time, and `Pipeline.counts`, of a capture.
     report : PackReport, optional
         Health, power and cells at the end.
     pack_rows : list
@@ -110,7 +110,7 @@ class RecordedEstimate:
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
     origin: Origin = "voltage"
     time_source: TimeSourceName | None = None
-    counts: FrameCounts | None = None
+    counts: dict[str, int] | None = None
     report: PackReport | None = None
     pack_rows: PackRows = field(default_factory=list)
 
@@ -150,11 +150,7 @@ class RecordedEstimate:
     def to_dict(self) -> dict[str, Any]:
         """Return the object that `cangauge estimate --json` prints, without the file names."""
         settings = self.settings
-        of_capture = (
-            {}
-            if self.counts is None
-            else {"time_source": self.time_source, "frames": asdict(self.counts)}
-        )
+        of_capture = {"time_source": self.time_source, "frames": self.counts}
         return {
             **vars(self.scores),
             "method": settings.method,
@@ -164,7 +160,7 @@ class RecordedEstimate:
             "max_gap_s": settings.gap_s,
             "reasons": self.reason_shares,
             **(NO_REPORT if self.report is None else self.report.to_dict()),
-            **of_capture,
+            **({} if self.counts is None else of_capture),
         }
 
 
@@ -297,8 +293,7 @@ def estimate_capture(
     def open_bus(source: TimeSourceName) -> _Bus:
         ids = FrameIds(replay_clock=clock_id)
         chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
-        pipeline = Pipeline(vehicle, model, chosen, publishes=False)
-        return _Bus(source, pipeline)
+        return _Bus(Pipeline(vehicle, model, chosen, publishes=False))
 
     frames = frames_of_buses(capture, buses, open_bus, clock_id)
     for number, (bus, message) in enumerate(frames, start=1):
@@ -317,16 +312,12 @@ def estimate_capture(
             field=vehicle.current.message,
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
-    best = max(found, key=_Bus.samples)
+    best = max(found, key=attrgetter("pipeline.samples"))
     pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
-    counts = pipeline.counts
-    settings = pipeline.estimator.settings
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
-    time_s, statistics = _without_steps_back(time_s), pipeline.decoder.statistics
-    unseen = pipeline.decoder.never_decoded
-    remarks = _remarks(best.source, counts, statistics.two_senders, len(found))
+    settings, statistics = pipeline.estimator.settings, pipeline.decoder.statistics
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).T
     recorded = CaptureSamples(
-        time_s,
+        _without_steps_back(time_s),
         current_a,
         voltage_v,
         temperature_c,
@@ -334,7 +325,12 @@ def estimate_capture(
         str(path),
         settings.temperature_source,
         statistics,
-        (*vehicle.remarks, *capture.info["remarks"], *remarks, *unseen.values()),
+        (
+            *vehicle.remarks,
+            *capture.info["remarks"],
+            *_remarks(pipeline, len(found)),
+            *pipeline.decoder.never_decoded.values(),
+        ),
     )
     # With a model, another pack's voltage is implausible, and a current that wraps.
     wraps = statistics.messages[vehicle.current.key].implausible > 0
@@ -351,8 +347,8 @@ def estimate_capture(
         model,
         settings,
         origin,
-        best.source,
-        counts,
+        pipeline.settings.time_source,
+        pipeline.counts,
         pipeline.report(),
         best.pack_rows,
     )
@@ -366,53 +362,41 @@ def _without_steps_back(time_s: FloatArray) -> FloatArray:
     return np.asarray(time_s[0] + np.concatenate(([0.0], np.cumsum(np.maximum(steps_s, 0.0)))))
 
 
-def _no_values() -> array[float]:
-    return array("d")
-
-
 @dataclass
 class _Bus:
-    """One of the buses in a capture; each has its own pipeline."""
+    """One of the buses in a capture; each has its own pipeline.
 
-    source: TimeSourceName
+    `values` are time, current, voltage, temperature and the vehicle's own SoC of every sample.
+    """
+
     pipeline: Pipeline
     estimates: list[Estimate] = field(default_factory=list)
-    # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
-    values: array[float] = field(default_factory=_no_values)
-
+    values: list[tuple[float, ...]] = field(default_factory=list)
     pack_rows: PackRows = field(default_factory=list)
-
-    def samples(self) -> int:
-        """Return the number of samples so far."""
-        return len(self.estimates)
 
     def collect(self, *, keeps_pack: bool) -> None:
         """Keep the latest sample with its estimate, and health, power and cells if asked for."""
         sample = self.pipeline.latest_sample
         if sample is not None:
             self.estimates.append(self.pipeline.latest)
-            self.values.extend((*sample, self.pipeline.decoder.reference_soc_pct))
+            self.values.append((*sample, self.pipeline.decoder.reference_soc_pct))
             if keeps_pack:
                 _add_row(self.pack_rows, PACK_EVERY_S, sample.time_s, self.pipeline.report)
 
 
-def _remarks(
-    time_source: TimeSourceName, counts: FrameCounts, two_senders: int, buses: int
-) -> list[str]:
-    remarks = []
-    if time_source == "replay-clock":
-        remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
-    if counts.beginnings:
-        remarks.append(f"{counts.beginnings + 1} logs were replayed; each is estimated separately")
-    if counts.steps_back:
-        sessions = f"the stamps start again: {counts.steps_back + 1} sessions in one file"
-        remarks.append(f"{sessions}, estimated as one: split it there")
-    if counts.crc_errors:
-        remarks.append(f"{counts.crc_errors} frames refused: wrong CRC")
-    if counts.lost:
-        remarks.append(f"{counts.lost} frames lost, by their alive counters")
-    if two_senders:
-        remarks.append(f"{two_senders} frames refused: two senders use their id or PGN")
-    if buses > 1:
-        remarks.append("several buses carry the frames; the one with most samples is used")
-    return remarks
+def _remarks(pipeline: Pipeline, buses: int) -> list[str]:
+    """Return what a user must know of a capture's frames."""
+    counts, two_senders = pipeline.counts, pipeline.decoder.statistics.two_senders
+    remarks = {
+        "a recorded replay: time is its log's (REPLAY_CLOCK)": pipeline.is_replay,
+        f"{counts['beginnings'] + 1} logs were replayed; each is estimated separately": counts[
+            "beginnings"
+        ],
+        f"the stamps start again: {counts['steps_back'] + 1} sessions in one file, estimated as"
+        " one: split it there": counts["steps_back"],
+        f"{counts['crc_errors']} frames refused: wrong CRC": counts["crc_errors"],
+        f"{counts['lost']} frames lost, by their alive counters": counts["lost"],
+        f"{two_senders} frames refused: two senders use their id or PGN": two_senders,
+        "several buses carry the frames; the one with most samples is used": buses > 1,
+    }
+    return [text for text, applies in remarks.items() if applies]

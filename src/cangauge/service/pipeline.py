@@ -26,46 +26,14 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.model.model_file import Model
 from cangauge.settings import FrameIds, TimeSourceName
-from cangauge.types import Estimate, Reason, Sample, Status, status_of
+from cangauge.types import REASONS, Estimate, Reason, Sample, Status, status_of
 
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)
 """The estimate before the first sample."""
 
 
-@dataclass(frozen=True)
-class FrameCounts:
-    """Frames and values by outcome, over all logs of a run.
-
-    Parameters
-    ----------
-    frames, samples : int
-        Frames received, wanted or not; samples decoded from them.
-    lost : int
-        Frames that are missing by the alive counters and by the counts of a replay's clock.
-    crc_errors, repeated, short : int
-        Refused frames: with a wrong CRC, with a repeated alive counter, with too few bytes.
-    not_available, implausible, stuck, held_back : int
-        Refused values: coded as not available; out of range or changed too fast; of a stuck signal;
-        plausible, but of a signal that has not recovered yet.
-    untimed : int
-        Frames before the first REPLAY_CLOCK, where that is the time source.
-    beginnings, steps_back : int
-        Logs that began; times that the receive stamps stepped back.
-    """
-
-    frames: int
-    samples: int
-    lost: int
-    crc_errors: int
-    repeated: int
-    short: int
-    not_available: int
-    implausible: int
-    stuck: int
-    held_back: int
-    untimed: int
-    beginnings: int
-    steps_back: int
+_VOLTAGE_MISSING: Final = int(Reason.VOLTAGE_MISSING)
+_INPUT_STALE: Final = int(Reason.INPUT_STALE)
 
 
 @dataclass(frozen=True)
@@ -92,7 +60,7 @@ class Pipeline:
     model : Model
     settings : PipelineSettings, optional
     publishes : bool
-        False: no frames are made, and the vehicle may use their ids.
+        False: no frames are asked for, and the vehicle may use their ids.
 
     Attributes
     ----------
@@ -109,7 +77,7 @@ class Pipeline:
     is_replay : bool
         Whether bus time is a replay's.
     stamp_shift_s : float
-        What is added to the frames' stamps since their clock was set [s].
+        What was added to the frames' stamps since their clock was set [s].
     latest_sample : Sample or None
     published : Estimate
         The one in the frames made last: `latest`, or at a heartbeat what is true of it then.
@@ -133,11 +101,10 @@ class Pipeline:
         self.vehicle, self.model = vehicle, model
         self.settings = settings = settings or PipelineSettings()
         self.is_replay = settings.time_source == "replay-clock"
-        self._publisher: SocPublisher | None = None
         if publishes:
             _check_ids(vehicle, settings.ids)
-            every = ACKNOWLEDGE_EVERY if self.is_replay else None
-            self._publisher = SocPublisher(settings.ids, every)
+        every = ACKNOWLEDGE_EVERY if self.is_replay else None
+        self._publisher = SocPublisher(settings.ids, every)
         self._time = time_source(settings.time_source, settings.ids.replay_clock)
         self._statistics = FrameStatistics()
         self._beginnings = self._untimed = 0
@@ -147,11 +114,20 @@ class Pipeline:
         self.latest_sample: Sample | None = None
         self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
-        self._report: tuple[int, PackReport] | None = None
-        self._findings: tuple[Reason, Reason, bool, bool] | None = None
+        self._report: PackReport | None = None
         self.estimator = make_estimator(model, _with_sensors(settings.estimator, vehicle))
-        self._pack = _pack_of(self.estimator)
         self._begin_signals()
+
+    def _begin_signals(self) -> None:
+        """Begin to judge the signals anew, for the present vehicle and model."""
+        self._pack = _pack_of(self.estimator)
+        self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
+        self._voltage_s, self._without_voltage = math.inf, 0
+        self._begin_cells()
+
+    def _begin_cells(self) -> None:
+        cells, model = self.vehicle.cells_map, self.estimator.voltage_model
+        self.cells = None if cells is None else CellEstimator(model, cells.count, cells.first)
 
     # --- frames → estimates
 
@@ -166,7 +142,9 @@ class Pipeline:
             self._untimed += not (is_clock(message, clock_id) or is_count(message, clock_id))
             return False
         if self._time.beginnings != self._beginnings:
-            self._begin_log()
+            self._beginnings, self._refused = self._time.beginnings, 0
+            self.estimator = make_estimator(self.model, self.estimator.settings)
+            self._begin_signals()
         message.timestamp = time_s
         sample = self.decoder.handle(message)
         if sample is None:
@@ -193,40 +171,71 @@ class Pipeline:
 
     def report(self) -> PackReport:
         """Return health, power and cells after the latest sample; computed once a sample."""
-        if self._report is None or self._report[0] != self.samples:
+        if self._report is None:
             cells = None if self.cells is None else self.cells.report
-            report = PackReport(self.estimator.health, self.estimator.power(), cells)
-            self._report = self.samples, report
-        return self._report[1]
+            self._report = PackReport(self.estimator.health, self.estimator.power(), cells)
+        return self._report
 
     @property
-    def counts(self) -> FrameCounts:
-        """Frames and values by outcome so far."""
-        all_logs = self._statistics
-        return FrameCounts(
-            frames=all_logs.frames,
-            samples=all_logs.samples,
-            lost=all_logs.frames_lost + self._time.lost,
-            crc_errors=all_logs.crc_errors,
-            repeated=all_logs.counter_repeats,
-            short=all_logs.short,
-            not_available=all_logs.not_available,
-            implausible=all_logs.implausible,
-            stuck=all_logs.stuck,
-            held_back=all_logs.held_back,
-            untimed=self._untimed,
-            beginnings=self._time.beginnings,
-            steps_back=self._time.steps_back,
-        )
+    def counts(self) -> dict[str, int]:
+        """Frames and values by outcome so far, over all logs of a run.
+
+        - frames, samples: frames received, wanted or not; samples decoded from them.
+        - lost: frames that are missing by the alive counters and by the counts of a replay's clock.
+        - crc_errors, repeated, short: frames refused for a wrong CRC, a repeated alive counter, too
+          few bytes.
+        - not_available, implausible, stuck, held_back: values coded as not available; out of range
+          or changed too fast; of a stuck signal; plausible, but of a signal that has not recovered.
+        - untimed: frames before the first REPLAY_CLOCK, where that is the time source.
+        - beginnings, steps_back: logs that began; times that the receive stamps stepped back.
+        """
+        found = self._statistics
+        return {
+            "frames": found.frames,
+            "samples": found.samples,
+            "lost": found.frames_lost + self._time.lost,
+            "crc_errors": found.crc_errors,
+            "repeated": found.counter_repeats,
+            "short": found.short,
+            "not_available": found.not_available,
+            "implausible": found.implausible,
+            "stuck": found.stuck,
+            "held_back": found.held_back,
+            "untimed": self._untimed,
+            "beginnings": self._time.beginnings,
+            "steps_back": self._time.steps_back,
+        }
+
+    @property
+    def is_unpaired(self) -> bool:
+        """Whether good voltages come, but no longer with a current."""
+        return self._lacks_voltage and self.decoder.health["voltage"].is_usable(self.decoder.now_s)
+
+    @property
+    def _lacks_voltage(self) -> bool:
+        """Whether samples lack the voltage lastingly, though its frames may come.
+
+        They do when several consecutive samples have no voltage, and the last voltage is older than
+        its time-out. The number alone is not enough: a voltage that is sent less often than the
+        current is in few samples.
+        """
+        if self.latest_sample is None or self._without_voltage < MISSED_AT_LEAST:
+            return False
+        age_s = self.latest_sample.time_s - self._voltage_s
+        return age_s > self.decoder.health["voltage"].timeout_s
 
     def _estimate_after(self, sample: Sample) -> None:
         self.samples += 1
-        self.latest_sample = sample
+        self.latest_sample, self._report = sample, None
         is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
         # The estimator treats a refused voltage otherwise than one that never came, as offline.
         self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
         self._estimate = self.estimator.estimate
-        self._note_voltage(sample)
+        if math.isnan(sample.voltage_v):
+            self._voltage_s = min(self._voltage_s, sample.time_s)  # time may run backwards
+            self._without_voltage += 1
+        else:
+            self._voltage_s, self._without_voltage = sample.time_s, 0
         self._refused = self._refused + 1 if self.estimator.is_refused else 0
         self.taken += not self.estimator.is_refused
         cells, received = self.cells, self.decoder.cells
@@ -234,28 +243,6 @@ class Pipeline:
             volts, times = received.take(sample.time_s)
             changes = self.estimator.current_changes(sample.time_s, times)
             cells.update(self.estimator.pack_tick(sample), volts, changes)
-
-    def _note_voltage(self, sample: Sample) -> None:
-        """Note whether samples lack the voltage lastingly, though its frames may come.
-
-        They do when several consecutive samples have no voltage, and the last voltage is older than
-        its time-out. The number alone is not enough: a voltage that is sent less often than the
-        current is in few samples.
-        """
-        if not math.isnan(sample.voltage_v):
-            self._voltage_s, self._without_voltage = sample.time_s, 0
-            self._lacks_voltage = False
-            return
-        self._voltage_s = min(self._voltage_s, sample.time_s)  # time may run backwards
-        self._without_voltage += 1
-        is_old = sample.time_s - self._voltage_s > self.decoder.health["voltage"].timeout_s
-        self._lacks_voltage = is_old and self._without_voltage >= MISSED_AT_LEAST
-
-    @property
-    def is_unpaired(self) -> bool:
-        """Whether good voltages come, but no longer with a current."""
-        is_good = self.decoder.health["voltage"].is_usable(self.decoder.now_s)
-        return self._lacks_voltage and is_good
 
     def _with_health(self, now_s: float) -> Estimate:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
@@ -265,35 +252,12 @@ class Pipeline:
         other do not make an estimate fresh.
         """
         estimate = self._estimate
-        findings = (
-            estimate.reasons,
-            self.decoder.reasons(now_s),
-            self._lacks_voltage,
-            self._refused >= MISSED_UNTIL_OLD,
-        )
-        if findings != self._findings:  # they change seldom, and flags are slow
-            self._findings = findings
-            self._reasons = _all_reasons(*findings)
-            self._status = status_of(self._reasons)
-        if self._reasons == estimate.reasons:
-            return estimate
-        return estimate._replace(reasons=self._reasons, status=self._status)
-
-    def _begin_log(self) -> None:
-        """Restart estimator and decoder for the next log of a replay."""
-        self._beginnings, self._refused = self._time.beginnings, 0
-        self.estimator = make_estimator(self.model, self.estimator.settings)
-        self._begin_signals()
-
-    def _begin_signals(self) -> None:
-        """Begin to judge the signals anew, for the present vehicle and model."""
-        self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
-        self._voltage_s, self._without_voltage, self._lacks_voltage = math.inf, 0, False
-        self._begin_cells()
-
-    def _begin_cells(self) -> None:
-        cells, model = self.vehicle.cells_map, self.estimator.voltage_model
-        self.cells = None if cells is None else CellEstimator(model, cells.count, cells.first)
+        bits = int(estimate.reasons) & ~_VOLTAGE_MISSING | int(self.decoder.reasons(now_s))
+        if self._lacks_voltage:
+            bits |= _VOLTAGE_MISSING
+        if self._refused >= MISSED_UNTIL_OLD:
+            bits |= _INPUT_STALE
+        return estimate if bits == estimate.reasons else _with_reasons(estimate, REASONS[bits])
 
     # --- estimates → frames
 
@@ -304,9 +268,9 @@ class Pipeline:
         clock = [standard_filter(clock_id), standard_filter(clock_id - 1)]
         return [*self.vehicle.filters, *(clock if self.is_replay else [])]
 
-    def acknowledgement(self, estimate: Estimate) -> list[can.Message]:
+    def replay_frames(self, estimate: Estimate) -> list[can.Message]:
         """Return the frames due with the latest sample's estimate in a replay, else none."""
-        if not self.is_replay or self._publisher is None:
+        if not self.is_replay:
             return []
         self.published, self.published_samples = estimate, self.samples
         return self._publisher.publish(estimate, self.samples, self.report)
@@ -324,34 +288,41 @@ class Pipeline:
         silent_s : float
             Time since the latest sample that the estimator took [s].
         timeout_s : float
-            Longest silence at which the estimate is still fresh [s]. With receive stamps it is
-            raised to some periods of the current (`MISSED_AT_LEAST`), so that a slow source does
-            not make the estimate stale. It is then at most the current's own time-out.
+            Longest silence at which the estimate is still fresh [s]; see `_is_stale`.
         reasons : Reason
             Findings of the loop.
         """
-        if self._publisher is None:
-            return []
-        estimate = self.estimate_now()
+        if self._is_stale(silent_s, timeout_s):
+            reasons |= Reason.INPUT_STALE
+        self.published = self._aged(self.estimate_now(), silent_s, reasons)
+        self.published_samples = self.samples
+        age_s = silent_s if self.taken else math.nan
+        return self._publisher.publish_periodic(self.published, self.samples, age_s, self.report)
+
+    def _is_stale(self, silent_s: float, timeout_s: float) -> bool:
+        """Return whether a silence is too long.
+
+        With receive stamps some periods of the current are never too long, so that a slow source
+        does not make the estimate stale; the current's own time-out always is.
+        """
         if not self.is_replay:
             current = self.decoder.health["current"]
             if not math.isnan(current.period_s):
                 timeout_s = max(timeout_s, MISSED_AT_LEAST * current.period_s)
             timeout_s = min(timeout_s, current.timeout_s)
-        if silent_s > timeout_s and self.taken:
-            reasons |= Reason.INPUT_STALE
+        return silent_s > timeout_s and self.taken > 0
+
+    def _aged(self, estimate: Estimate, silent_s: float, reasons: Reason) -> Estimate:
+        """Return an estimate with further reasons; an invalid one with the charge not counted.
+
+        While samples come that charge is little: the estimate is then invalid by model or sign.
+        """
         if reasons:
-            reasons |= estimate.reasons
-            estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
-        if estimate.status is Status.INVALID:
-            # Widen by the charge that was not counted in the silence. It is little while samples
-            # come: the estimate is then invalid by its model or sign.
-            missing_pct = self.estimator.uncounted_std_pct(silent_s)
-            std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
-            estimate = estimate._replace(soc_std_pct=std_pct)
-        self.published, self.published_samples = estimate, self.samples
-        age_s = silent_s if self.taken else math.nan
-        return self._publisher.publish_periodic(estimate, self.samples, age_s, self.report)
+            estimate = _with_reasons(estimate, estimate.reasons | reasons)
+        if estimate.status is not Status.INVALID:
+            return estimate
+        missing_pct = self.estimator.uncounted_std_pct(silent_s)
+        return estimate._replace(soc_std_pct=math.hypot(estimate.soc_std_pct, missing_pct))
 
     # --- reload and restart
 
@@ -365,28 +336,26 @@ class Pipeline:
         REPLAY_CLOCK's id always stay. InputError, and no change, if a frame to publish has the id
         of a vehicle's signal, or settings contradict the model.
         """
-        old, before = self.settings, self.estimator
-        ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
-        if self._publisher is not None:
-            _check_ids(vehicle, ids)
+        before, judged_by = self.estimator, (self.vehicle, self._pack)
+        is_other_model = model != self.model
+        ids = replace(settings.ids, replay_clock=self.settings.ids.replay_clock)
+        _check_ids(vehicle, ids)
         chosen = replace(
             _with_sensors(settings.estimator, vehicle),
             initial_soc_pct=before.settings.initial_soc_pct,
             initial_soc_std_pct=before.settings.initial_soc_std_pct,
         )
-        estimator, is_other_model = before, model != self.model
         if vehicle.battery != self.vehicle.battery:
-            estimator, self._estimate = make_estimator(model, _from_voltage(chosen)), NOTHING_YET
+            self.estimator = make_estimator(model, _from_voltage(chosen))
+            self._estimate = NOTHING_YET
         elif is_other_model or chosen != before.settings:
             estimator = make_estimator(model, chosen)
             estimator.take_over(before)
-        judged_by, pack = (self.vehicle, self._pack), _pack_of(estimator)
-        self.estimator = estimator
-        self.settings = replace(settings, ids=ids, time_source=old.time_source)
-        self.vehicle, self.model, self._pack, self._report = vehicle, model, pack, None
-        if self._publisher is not None:
-            self._publisher.ids = ids
-        if judged_by != (vehicle, pack):
+            self.estimator = estimator
+        self.settings = replace(settings, ids=ids, time_source=self.settings.time_source)
+        self.vehicle, self.model, self._report = vehicle, model, None
+        self._publisher.ids = ids
+        if judged_by != (vehicle, _pack_of(self.estimator)):
             self._begin_signals()
         elif is_other_model:
             self._begin_cells()
@@ -443,19 +412,8 @@ def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
     return replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
 
 
-def _all_reasons(
-    of_estimate: Reason,
-    of_signals: Reason,
-    lacks_voltage: bool,
-    is_refused: bool,
-) -> Reason:
-    """Return the reasons of an estimate, with the findings about its inputs."""
-    reasons = (of_estimate & ~Reason.VOLTAGE_MISSING) | of_signals
-    if lacks_voltage:
-        reasons |= Reason.VOLTAGE_MISSING
-    if is_refused:
-        reasons |= Reason.INPUT_STALE
-    return reasons
+def _with_reasons(estimate: Estimate, reasons: Reason) -> Estimate:
+    return estimate._replace(reasons=reasons, status=status_of(reasons))
 
 
 def _with_sensors(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:

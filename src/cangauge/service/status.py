@@ -237,7 +237,7 @@ class Monitor:
                 "received": statistics.frames,
                 "wanted": statistics.wanted,
                 "used": statistics.wanted - rejected,
-                "lost": pipeline.counts.lost,
+                "lost": pipeline.counts["lost"],
             },
             "rejects": rejects,
             "stamps": port.address.stamps,
