@@ -41,7 +41,7 @@ def names() -> Iterator[str]:
     """Yield kind and name of everything that a user can name."""
     for name in COMMANDS:
         yield from options_of(load_command(name), name)
-    yield from (f"key {key.name}" for key in config_keys())
+    yield from (f"key {name}" for name in config_keys())
     yield from (f"public cangauge.{name}" for name in cangauge.__all__)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for line in project["dependencies"]:

@@ -57,7 +57,7 @@ def setting(text: str, **more: Any) -> Any:
     """
     names = ("unit", "default_text", "option", "metavar", "restart", "is_path")
     about = {name: more.pop(name) for name in names if name in more}
-    return Field(description=text, json_schema_extra={"key": about}, **more)
+    return Field(description=text, json_schema_extra=about, **more)
 
 
 def check_settings(settings: Any, table: str = "") -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
@@ -142,18 +141,18 @@ def test_the_interface_of_a_missing_bus_follows_from_its_name() -> None:
 
 
 def test_each_key_is_described_and_each_option_declared_once() -> None:
-    keys = {key.name: key for key in config_keys()}
+    keys = config_keys()
     assert set(keys) > {"model", "ids.soc_estimate", "full_charge.voltage_v"}
-    assert all(key.text for key in keys.values())
-    flags = [flag for key in keys.values() for flag in re.split(", ", key.option) if flag]
+    assert all(key["description"] for key in keys.values())
+    flags = [flag for key in keys.values() if "option" in key for flag in key["option"].split(", ")]
     assert len(flags) == len(set(flags))
-    until = keys["until_idle_s"]
-    assert (until.option, until.unit, until.bounds) == ("", "s", "> 0, ≤ 1e+09")
+    (row,) = [row for row in reference().splitlines() if "`until_idle_s`" in row]
+    assert row.startswith("| `until_idle_s` |  | number |  | s | > 0, ≤ 1e+09 | Stop when")
 
 
 def test_the_reference_has_a_row_for_each_key() -> None:
     rows = reference().splitlines()[2:]
-    assert [row.split("`")[1] for row in rows] == [key.name for key in config_keys()]
+    assert [row.split("`")[1] for row in rows] == list(config_keys())
 
 
 def test_check_reads_what_run_would_read(tmp_path: Path) -> None:

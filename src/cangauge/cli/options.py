@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from cangauge.logs.draft import Sign
     from cangauge.logs.log import Log
     from cangauge.logs.read import CellColumns, LogFile
-    from cangauge.service.config import ConfigKey
 
 # The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
 
@@ -375,22 +374,27 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
 
 def config_parameters(*names: str) -> list[inspect.Parameter]:
     """Return the options of keys, such as "channel", as typer reads them; without names of all."""
-    from cangauge.service.config import config_keys
+    from cangauge.service.config import config_keys, default_of
 
-    keys = [key for key in config_keys() if key.option]
-    return [_parameter(key) for key in keys if not names or key.name in names]
-
-
-def _parameter(key: ConfigKey) -> inspect.Parameter:
-    kind: Any = Path if key.is_path else float if key.kind == "number" else str
-    if key.name == "bus_options":
-        kind = list[str]
-    elif key.name == "initial_soc":  # "auto" is no number: checked by the configuration
-        kind = str
-    flags, metavar = key.option.split(", "), key.metavar or None
-    option = Annotated[kind | None, typer.Option(*flags, metavar=metavar, help=key.help)]
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    return inspect.Parameter(key.name, keyword, default=None, annotation=option)
+    made = []
+    for name, key in config_keys().items():
+        if "option" not in key or (names and name not in names):
+            continue
+        kind: Any = Path if key.get("is_path") else float if key.get("type") == "number" else str
+        if name == "bus_options":
+            kind = list[str]
+        elif name == "initial_soc":  # "auto" is no number: checked by the configuration
+            kind = str
+        first, dot, more = key["description"].partition(". ")
+        unit = f" [{key['unit']}]" if "unit" in key else ""
+        text = f"{first.removesuffix('.')}{unit}.{dot[1:]}{more}"
+        if default := default_of(key):
+            text += f" Default: {default}."
+        option = typer.Option(*key["option"].split(", "), metavar=key["metavar"], help=text)
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        annotation = Annotated[kind | None, option]
+        made.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
+    return made
 
 
 def config_values(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,6 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from os import PathLike
 from pathlib import Path
@@ -67,7 +66,8 @@ DEFAULT_VEHICLE: Final = "generic"
 
 def key(default: Any, text: str, option: str = "", metavar: str = "", **more: Any) -> Any:
     """Return the field of a key with its default; further arguments as of `setting`."""
-    return setting(text, default=default, option=option, metavar=metavar, **more)
+    about = {"option": option, "metavar": metavar} if option else {}
+    return setting(text, default=default, **about, **more)
 
 
 class PollConfig(BaseModel, extra="forbid", frozen=True):
@@ -422,12 +422,12 @@ def load_config(
     _check_options(given)  # separately, so that an error names the source of the value
     data = {} if path is None else read_toml(path)
     validated(RunConfig, {"model": "-", **data}, path or "")
-    for each in config_keys():
-        *tables, name = each.name.split(".")
+    for place in [name for name, key in config_keys().items() if key.get("is_path")]:
+        *tables, name = place.split(".")
         table = data
-        for key in tables:
-            table = table.get(key, {})
-        if path is not None and each.is_path and name in table:
+        for each in tables:
+            table = table.get(each, {})
+        if path is not None and name in table:
             table[name] = str(Path(path).parent / table[name])
     if given.keys() & {"vehicle", "dbc", "map"}:  # replaces the file's vehicle as a whole
         data = {name: data[name] for name in data if name not in {"vehicle", "dbc", "map"}}
@@ -446,42 +446,48 @@ def _check_options(given: Mapping[str, Any]) -> None:
     try:
         validated(RunConfig, {"model": "-", **given}, "")
     except InputError as error:
-        options = {each.name: each.option for each in config_keys() if each.option}
-        option = options.get(error.field or "", error.field or "").rpartition(", ")[2]
+        key = config_keys().get(error.field or "", {})
+        option = key.get("option", error.field or "").rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
 
 
 # --- Description of the keys
 
 
-@dataclass(frozen=True)
-class ConfigKey:
-    """A key of the configuration, for the reference and the command line, in words.
+@cache
+def config_keys() -> dict[str, dict[str, Any]]:
+    """Return all keys by their dotted names, such as "ids.soc_detail".
 
-    `name` is dotted, such as "ids.soc_detail"; `kind` is the type. `option` is that of `cangauge
-    run`, such as "-m, --model" ("": a key of the file only), `metavar` the placeholder of its
-    value. A reload does not apply a change of a key with `restart`; paths are relative to the file
-    that they are in.
+    Each is its JSON schema, with what `setting` states of it.
     """
+    schema = RunConfig.model_json_schema()
+    return dict(_keys(schema, schema["$defs"]))
 
-    name: str
-    kind: str
-    default: str
-    bounds: str
-    text: str
-    option: str = ""
-    metavar: str = ""
-    unit: str = ""
-    restart: bool = False
-    is_path: bool = False
 
-    @property
-    def help(self) -> str:
-        """Help text of the option, with unit and default."""
-        first, dot, more = self.text.partition(". ")
-        unit = f" [{self.unit}]" if self.unit else ""
-        text = f"{first}{unit}. {more}" if dot else f"{first.removesuffix('.')}{unit}."
-        return f"{text} Default: {self.default}." if self.default else text
+def _keys(
+    table: dict[str, Any], tables: dict[str, Any], prefix: str = "", *, restart: bool = False
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, field in table["properties"].items():
+        # The type of an optional key is one of two; the other one is null.
+        kind = field.get("anyOf", [field])[0]
+        inner = tables.get(kind.get("$ref", "").rpartition("/")[2], {})
+        key = {"restart": restart} | kind | field
+        if "properties" in inner:
+            yield from _keys(inner, tables, f"{prefix}{name}.", restart=key["restart"])
+        else:
+            yield prefix + name, key
+
+
+def default_of(key: Mapping[str, Any]) -> str:
+    """Return the default of a key in words, "" for none."""
+    default, text = key.get("default"), key.get("default_text", "")
+    if text or default is None or isinstance(default, dict):
+        return str(text)
+    if isinstance(default, bool):
+        return str(default).lower()
+    if key.get("metavar") == "ID":
+        return f"0x{default:X}"
+    return f"{default:.10g}" if isinstance(default, float) else str(default)
 
 
 _KINDS: Final = {
@@ -493,48 +499,17 @@ _KINDS: Final = {
 _BOUNDS: Final = {"exclusiveMinimum": ">", "minimum": "≥", "maximum": "≤"}
 
 
-@cache
-def config_keys() -> tuple[ConfigKey, ...]:
-    """Return all keys, from the JSON schema of the configuration."""
-    schema = RunConfig.model_json_schema()
-    return tuple(_keys(schema, schema["$defs"]))
-
-
-def _keys(
-    table: dict[str, Any], tables: dict[str, Any], prefix: str = "", *, restart: bool = False
-) -> Iterator[ConfigKey]:
-    for name, field in table["properties"].items():
-        # The type of an optional key is one of two; the other one is null.
-        kind = field.get("anyOf", [field])[0]
-        inner = tables.get(kind.get("$ref", "").rpartition("/")[2], {})
-        about = {"restart": restart} | kind.get("key", {}) | field.get("key", {})
-        if "properties" in inner:
-            needs_restart = about["restart"]
-            yield from _keys(inner, tables, f"{prefix}{name}.", restart=needs_restart)
-            continue
-        default = field.get("default")
-        if (text := about.pop("default_text", "")) or default is None or isinstance(default, dict):
-            default = text
-        elif isinstance(default, bool):
-            default = str(default).lower()
-        elif isinstance(default, float):
-            default = f"{default:.10g}"
-        elif about.get("metavar") == "ID":
-            default = f"0x{default:X}"
-        values = kind.get("enum")
-        words = f"one of {', '.join(values)}" if values else _KINDS.get(kind.get("type"), "table")
-        bounds = [f"{sign} {kind[bound]:g}" for bound, sign in _BOUNDS.items() if bound in kind]
-        help_text = field.get("description") or kind["description"]
-        yield ConfigKey(prefix + name, words, str(default), ", ".join(bounds), help_text, **about)
-
-
 def reference() -> str:
     """Return the reference of all keys as a Markdown table."""
     rows = [("Key", "Option", "Type", "Default", "Unit", "Bounds", "Meaning"), ("---",) * 7]
-    for each in config_keys():
-        option = ", ".join(f"`{name}`" for name in each.option.split(", ") if name)
-        about = (each.kind, each.default, each.unit, each.bounds, each.text)
-        rows.append((f"`{each.name}`", option, *about))
+    for name, key in config_keys().items():
+        flags = [f"`{flag}`" for flag in key.get("option", "").split(", ") if flag]
+        kind = _KINDS.get(key.get("type", ""), "table")
+        if "enum" in key:
+            kind = f"one of {', '.join(key['enum'])}"
+        bounds = [f"{sign} {key[bound]:g}" for bound, sign in _BOUNDS.items() if bound in key]
+        about = (default_of(key), key.get("unit", ""), ", ".join(bounds), key["description"])
+        rows.append((f"`{name}`", ", ".join(flags), kind, *about))
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in cells)
 

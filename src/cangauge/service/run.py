@@ -309,9 +309,9 @@ def _log_changes(old: Setup, new: Setup) -> None:
         text += "; current or voltage are decoded otherwise: the SoC starts anew from the voltage"
     emit(_LOG, logging.INFO, "config.reloaded", text)
     late = ", ".join(
-        each.name
-        for each in config_keys()
-        if each.restart and value_at(before, each.name) != value_at(after, each.name)
+        name
+        for name, key in config_keys().items()
+        if key["restart"] and value_at(before, name) != value_at(after, name)
     )
     if late:
         text = f"{late}: takes effect after a restart of the service"
