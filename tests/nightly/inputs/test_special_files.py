@@ -18,6 +18,7 @@ from cangauge.errors import InputError
 from cangauge.extras.live.addresses import read_token
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
+from cangauge.service.state import read_state
 
 READERS: dict[str, Callable[[Path], object]] = {
     "log": read_log,
@@ -26,6 +27,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "map": lambda path: Vehicle.load(map=path),
     "config": load_config,
     "model": Model.load,
+    "state": read_state,
     "token": lambda path: read_token(path, {}),
 }
 
