@@ -8,8 +8,10 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from random import Random
+from unittest.mock import Mock
 
 import pytest
 
@@ -84,6 +86,22 @@ def test_logs_of_the_judge_survive_a_kill_at_any_write(tmp_path: Path) -> None:
         assert 1 <= len(stored_logs(tmp_path)) <= 4
         for path in stored_logs(tmp_path):
             assert len(open_log(path).read()) == len(rows)
+
+
+def test_a_wrong_clock_removes_no_log_of_the_judge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random, monday = Random(4), datetime(2026, 11, 30, tzinfo=UTC)  # noqa: S311 - repeatable
+    for seed in range(SEEDS):
+        (tmp_path / str(seed)).mkdir()
+        offs = [random.choice([-2.0, 0.0, 0.0, 1e-4, 2.0]) for _ in range(6)]
+        for number, years in enumerate(offs):
+            clock = Mock(now=Mock(return_value=monday + timedelta(days=365.0 * years)))
+            monkeypatch.setattr("cangauge.extras.judge.live.datetime", clock)
+            rows = [(float(row), 10.0, 380.0, 20.0, 50.0 + number) for row in range(300)]
+            store(tmp_path / str(seed), 3, rows)
+        kept = [open_log(path).read() for path in stored_logs(tmp_path / str(seed))]
+        assert [log.soc_pct[0] for log in kept] == [53.0, 54.0, 55.0]
 
 
 def test_a_full_disk_leaves_the_old_file_and_says_so(tmp_path: Path) -> None:

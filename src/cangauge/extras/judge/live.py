@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 import subprocess
 import sys
 import time
@@ -42,18 +43,21 @@ WITHIN_S: Final = 900.0
 CLOSE_WITHIN_S: Final = 2.0
 RESULT: Final = "judgement.json"
 PAGE: Final = "judgement.html"
+_NUMBER: Final = re.compile(r"\d+")
 
 _LOG = logging.getLogger(__name__)
 
 
 def stored_logs(folder: Path) -> list[Path]:
-    """Return the logs in a folder in order of time."""
+    """Return the logs in a folder in the order in which they were written."""
     # A hidden one is what a killed service was writing.
     return sorted(path for path in folder.glob("*.parquet") if not path.name.startswith("."))
 
 
 def store(folder: Path, keep: int, rows: Sequence[Sequence[float]]) -> None:
     """Write rows as a log, and remove the oldest beyond `keep`.
+
+    Its name begins with a number, since a date repeats and goes back where the clock is set.
 
     Parameters
     ----------
@@ -63,7 +67,8 @@ def store(folder: Path, keep: int, rows: Sequence[Sequence[float]]) -> None:
         Time, current, voltage, temperature and published SoC of each.
     """
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(rows).T
-    name = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+    last = [int(digits[0]) for log in stored_logs(folder) if (digits := _NUMBER.match(log.name))]
+    name = f"{max(last, default=0) + 1:06d}-{datetime.now(UTC):%Y%m%dT%H%M%S}"
     log = Log(time_s, current_a, voltage_v, temperature_c, soc_pct=soc_pct, name=name)
     write_log(log, folder / f"{name}.parquet")
     for old in stored_logs(folder)[:-keep]:
@@ -127,7 +132,10 @@ class LiveJudge(Output):
     def close(self) -> None:
         """Write what is kept; it is judged at the next start, and the last result stays."""
         self._end_stretch(is_judged=False)
-        self._worker.close(CLOSE_WITHIN_S)
+        if not self._worker.close(CLOSE_WITHIN_S):
+            _failed(
+                TimeoutError("a judgement was not over at the end; its last logs may be missing")
+            )
 
     def _end_stretch(self, *, is_judged: bool = True) -> None:
         rows, self._rows = self._rows, []
@@ -139,7 +147,8 @@ class LiveJudge(Output):
             if is_judged:
                 self._judge()
 
-        self._worker.submit(work)
+        if not self._worker.submit(work):
+            _failed(TimeoutError("earlier judgements take too long; a log was dropped"))
 
     def _judge(self) -> None:
         """Judge all logs; write the result and a page; raise InputError with the reason if not."""
