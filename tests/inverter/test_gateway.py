@@ -96,6 +96,25 @@ def test_the_soc_of_a_high_voltage_battery_is_replaced(pylon: Gateway) -> None:
     assert pylon.replaced(short, time.monotonic()).data == data
 
 
+def test_frames_that_waited_while_the_gateway_was_stopped_are_dropped(tmp_path: Path) -> None:
+    buses = [ReconnectingBus(BusAddress("virtual", f"{tmp_path} {side}"), []) for side in "bi"]
+    for bus in buses:
+        bus.open()
+    with (
+        can.Bus(f"{tmp_path} b", interface="virtual") as battery,
+        can.Bus(f"{tmp_path} i", interface="virtual") as inverter,
+        LoggedLines("cangauge.extras.inverter") as lines,
+    ):
+        battery.send(frame(0x351, V12[0x351]))
+        time.sleep(1.1 * DOUBT_S)
+        with closing(Gateway(*buses, soc_fields("pylontech"))):
+            assert waits(lambda: "longer than 0.5 s" in " ".join(lines.lines))
+            battery.send(frame(0x356, V12[0x356]))
+            came = inverter.recv(10.0)
+            assert came is not None
+            assert came.arbitration_id == 0x356
+
+
 @pytest.mark.parametrize(
     ("soc_pct", "told_pct"), [(99.4, 99), (99.5, 99), (99.99, 99), (100.0, 100)]
 )

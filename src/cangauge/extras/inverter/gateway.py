@@ -173,13 +173,27 @@ class Gateway(Output):
 
     def _hand_on_pending(self) -> None:
         """Hand on what has come in both directions."""
-        frames = self._battery.receive_pending(POLL_S)
+        frames = self._pending(self._battery)
         self._ever_own |= self._own_ids()
         for frame in frames:
             if frame.is_extended_id or frame.arbitration_id not in self._ever_own:
                 self._hand_on(self.replaced(frame, time.monotonic()), self._inverter)
-        for frame in self._inverter.receive_pending(POLL_S):
+        for frame in self._pending(self._inverter):
             self._hand_on(frame, self._battery)
+
+    def _pending(self, bus: ReconnectingBus) -> list[can.Message]:
+        """Return the frames that have come, without those that waited: this process was stopped.
+
+        The limits that a battery allowed long ago are no limits, and the next ones follow at once.
+        """
+        frames = bus.receive_pending(POLL_S)
+        if bus.address.stamps == "driver":  # by another clock
+            return frames
+        current = [each for each in frames if time.time() - each.timestamp <= DOUBT_S]
+        if len(current) < len(frames):
+            text = f"frames of {bus.name} that had waited longer than {DOUBT_S} s are dropped"
+            emit(_LOG, logging.WARNING, "inverter.late", text)
+        return current
 
     def _hand_on(self, frame: can.Message, bus: ReconnectingBus) -> None:
         """Send what a bus can carry: a frame that it cannot would count as a lost bus."""

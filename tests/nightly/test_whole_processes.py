@@ -1,0 +1,347 @@
+"""`cangauge run` as a process that is killed, stopped, starved or set to another time.
+
+Twenty seeds each. Nothing that was saved is lost, one line says what could not be saved, and no SoC
+is valid that comes from a state of unknown age.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from random import Random
+from typing import Any, Self
+
+import pytest
+
+from cangauge.bus.captures import open_capture
+from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.publish import SocReader
+from cangauge.bus.time_source import clock_frame
+from cangauge.bus.vehicle import Vehicle
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.extras.judge.live import stored_logs
+from cangauge.logs.read import open_log
+from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.state import StateKeeper, read_state
+from cangauge.settings import FrameIds
+from cangauge.types import Sample, Status
+from live import COMMAND, PATIENCE_S, leaf_model, leaf_model_path, short_log, waits
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and mounts of Linux")
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="root mounts")
+SEEDS = 20
+HOUR_S, YEAR_S = 3600.0, 365.0 * 86400.0
+STOPPED_S = float(os.environ.get("STOPPED_S", "600"))
+"""Time for which a process is stopped [s]; less for a trial."""
+VEHICLE, MODEL = Vehicle.load("generic"), leaf_model()
+DRIVE = list(samples_of(short_log(2000.0, 1.0)))
+STRETCH_S = 300
+"""Bus time after which a night follows, in replays [s]: the judge keeps the stretch as a log."""
+
+
+class Battery(threading.Thread):
+    """Sends a drive on a UDP bus and reads the estimates of a service.
+
+    Parameters
+    ----------
+    number : int
+        Of the bus.
+    samples : list of Sample
+        One each `every_s` [s].
+    is_replay : bool
+        Sends the time of the samples by REPLAY_CLOCK.
+    """
+
+    def __init__(
+        self, number: int, samples: list[Sample], every_s: float, *, is_replay: bool
+    ) -> None:
+        super().__init__(daemon=True)
+        self.address = BusAddress("udp_multicast", "239.74.163.7", {"port": 45_000 + number})
+        self._bus = open_bus(self.address)
+        self._samples, self._every_s, self._is_replay = samples, every_s, is_replay
+        self._over = threading.Event()
+        self.estimates: list[dict[str, Any]] = []
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+        self._bus.shutdown()
+
+    def run(self) -> None:
+        """Send the samples over and over, the later ones after a night."""
+        encoder, reader = FrameEncoder(VEHICLE), SocReader()
+        due_s, clock_us = time.monotonic(), 0
+        for number in range(1 << 40):
+            sample = self._samples[number % len(self._samples)]
+            clock_us += 1_000_000 if number % STRETCH_S else 700_000_000
+            if self._is_replay:
+                self._bus.send(clock_frame(clock_us, FrameIds().replay_clock))
+            for frame in encoder.encode(sample._replace(time_s=clock_us / 1e6), 60.0):
+                self._bus.send(frame)
+            due_s += self._every_s
+            while not self._over.is_set() and (left_s := due_s - time.monotonic()) > 0.0:
+                message = self._bus.recv(left_s)
+                name, values = reader.read(message) if message else ("", {})
+                if name == "soc_estimate":
+                    self.estimates.append(values)
+            if self._over.is_set():
+                return
+
+    def wait(self, more: int = 5) -> None:
+        """Wait for so many further estimates."""
+        wanted = len(self.estimates) + more
+        assert waits(lambda: len(self.estimates) >= wanted), "no estimates"
+
+    def statuses(self, since: int) -> set[Status]:
+        return {Status(int(each["status"])) for each in self.estimates[since:]}
+
+
+class Life:
+    """A service on a battery's bus, from its start to its end."""
+
+    def __init__(
+        self,
+        battery: Battery,
+        folder: Path,
+        *,
+        code: str = "",
+        **keys: str,
+    ) -> None:
+        port = battery.address.options["port"]
+        given = {
+            "model": f'"{leaf_model_path()}"',
+            "interface": '"udp_multicast"',
+            "channel": '"239.74.163.7"',
+            "bus_options": f"{{ port = {port} }}",
+            "state": '"cangauge-state.json"',
+            "state_every_s": "1.0",
+            "status_socket": '"off"',
+        } | keys
+        folder.mkdir(exist_ok=True)
+        self.config = folder.parent / f"{folder.name}.toml"
+        lines = [f"{key} = {value}\n" for key, value in given.items()]
+        # Paths are relative to the file, which lies beside a folder that may be full.
+        text = "".join(lines).replace('"cangauge-state.json"', f'"{folder}/cangauge-state.json"')
+        self.config.write_text(text.replace("FOLDER", str(folder)))
+        self.log = folder.parent / f"{folder.name}.txt"
+        with self.log.open("ab") as stderr:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", code + COMMAND, "run", "--config", str(self.config)],
+                stderr=stderr,
+                stdout=subprocess.DEVNULL,
+            )
+
+    @property
+    def text(self) -> str:
+        return self.log.read_text(errors="replace")
+
+    def end(self, kind: int = signal.SIGTERM) -> int:
+        self.process.send_signal(kind)
+        return self.process.wait(PATIENCE_S)
+
+
+REPLAY = {
+    "time_source": '"replay-clock"',
+    "judge": '{ folder = "FOLDER/judge", keep = 4 }',
+    "record": '"FOLDER/drive.log"',
+    "record_part_mb": "1",
+    "record_keep_mb": "4",
+}
+"""Everything that a service writes, at some 150 times the speed of the drive."""
+
+
+def check_saved(folder: Path) -> tuple[int, int]:
+    """Read all that a service has saved; return the numbers of logs and of recorded frames."""
+    state = folder / "cangauge-state.json"
+    if state.exists():
+        assert 0.0 <= read_state(state).estimator.soc_pct <= 100.0
+    for log in stored_logs(folder / "judge"):
+        assert len(open_log(log).read()) >= 240
+    recorded = sum(1 for part in folder.glob("drive-*.log") for _ in open_capture(part))
+    return len(stored_logs(folder / "judge")), recorded
+
+
+def clean(text: str) -> bool:
+    return "Traceback" not in text and "ERROR" not in text
+
+
+def test_kill(tmp_path: Path) -> None:
+    random, folder = Random(0), tmp_path / "life"  # noqa: S311 - repeatable
+    logs = 0
+    with Battery(0, DRIVE, 0.006, is_replay=True) as battery:
+        for _ in range(SEEDS):
+            life = Life(battery, folder, **REPLAY)
+            battery.wait()
+            time.sleep(random.uniform(0.0, 6.0))
+            life.end(signal.SIGKILL)
+            now, frames = check_saved(folder)
+            assert now >= min(logs, 4)
+            assert frames > 0
+            logs = now
+        life = Life(battery, folder, **REPLAY)
+        battery.wait()
+        assert life.end() == 0
+    assert logs > 1
+    assert clean(life.text)
+    assert life.text.count("state.restored") == SEEDS
+    assert "state.refused" not in life.text
+
+
+@contextmanager
+def disk(folder: Path, size_kb: int) -> Iterator[Callable[[str], object]]:
+    """Mount a small disk; yield what remounts it with other options."""
+    folder.mkdir(exist_ok=True)
+
+    def mount(options: str) -> None:
+        kind = ["-t", "tmpfs"] if not os.path.ismount(folder) else []
+        subprocess.run(["mount", *kind, "-o", options, "tmpfs", folder], check=True)
+
+    mount(f"size={size_kb}k")
+    try:
+        yield mount
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+@as_root
+@pytest.mark.parametrize("fault", ["full", "read-only"])
+def test_disk(fault: str, tmp_path: Path) -> None:
+    random = Random(1)  # noqa: S311 - repeatable
+    for seed in range(SEEDS):
+        folder = tmp_path / str(seed)
+        size_kb = random.randrange(80, 900) if fault == "full" else 20_000
+        with (
+            disk(folder, size_kb) as mount,
+            Battery(20, DRIVE, 0.006, is_replay=True) as battery,
+        ):
+            life = Life(battery, folder, **REPLAY)
+            battery.wait(20)
+            time.sleep(random.uniform(0.0, 2.0))
+            if fault == "read-only":
+                mount("remount,ro")
+            words = {"full": "free some space", "read-only": "read-only"}[fault]
+            assert waits(lambda: words in life.text.lower(), 60.0), life.text  # noqa: B023
+            battery.wait(20)  # it goes on
+            check_saved(folder)
+            saved_s = _saved_s(folder)
+            mount("remount,rw,size=20000k")
+            assert waits(lambda: _saved_s(folder) > saved_s, 60.0), life.text  # noqa: B023
+            assert life.end() == 0
+            check_saved(folder)
+            assert clean(life.text), life.text
+
+
+def _saved_s(folder: Path) -> float:
+    state = folder / "cangauge-state.json"
+    return read_state(state).saved_s if state.exists() else 0.0
+
+
+def write_state(path: Path, battery: Battery, seed: int) -> None:
+    """Write the state of a drive that has ended now, from which a SoC is valid at once."""
+    seconds = 150 + 10 * seed
+    began_s = time.time() - seconds
+    settings = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0, initial_soc_std_pct=0.5))
+    pipeline, encoder = Pipeline(VEHICLE, MODEL, settings), FrameEncoder(VEHICLE)
+    path.parent.mkdir(exist_ok=True)
+    keeper = StateKeeper(path, pipeline, str(battery.address), 86400.0)
+    keeper.__enter__()
+    for sample in DRIVE[:seconds]:
+        for frame in encoder.encode(sample._replace(time_s=sample.time_s + began_s), 60.0):
+            pipeline.handle(frame)
+    assert pipeline.latest.status == Status.VALID
+    keeper.__exit__()
+
+
+SHIFT = "import time; was = time.time; time.time = lambda: was() + {};"
+
+
+@pytest.mark.parametrize("off_s", [0.0, -2.0 * YEAR_S, -HOUR_S, HOUR_S, 2.0 * YEAR_S])
+def test_clock(off_s: float, tmp_path: Path) -> None:
+    for seed in range(SEEDS):
+        folder = tmp_path / str(seed)
+        with Battery(40, DRIVE[150 + 10 * seed :], 0.1, is_replay=False) as battery:
+            write_state(folder / "cangauge-state.json", battery, seed)
+            before = (folder / "cangauge-state.json").read_bytes()
+            life = Life(battery, folder, code=SHIFT.format(off_s))
+            battery.wait(20)
+            assert life.end() == 0
+            if off_s == 0.0:
+                assert Status.VALID in battery.statuses(0)
+            else:
+                assert Status.VALID not in battery.statuses(0)
+            words = "of unknown age" if off_s < 0.0 else "state.restored"
+            if off_s > 86400.0:
+                words = "state.refused"
+                assert (folder / "cangauge-state.json.refused").read_bytes() == before
+            assert words in life.text
+            assert clean(life.text), life.text
+
+
+def test_stopped(tmp_path: Path) -> None:
+    random = Random(2)  # noqa: S311 - repeatable
+    with ExitStack() as stack:
+        lives = []
+        for seed in range(SEEDS):
+            drive = DRIVE[150 + 10 * seed :]
+            battery = stack.enter_context(Battery(60 + seed, drive, 0.2, is_replay=False))
+            write_state(tmp_path / str(seed) / "cangauge-state.json", battery, seed)
+            life = Life(battery, tmp_path / str(seed))
+            stack.callback(life.process.kill)
+            battery.wait(20)
+            assert Status.VALID in battery.statuses(0)
+            time.sleep(random.uniform(0.0, 1.0))
+            life.process.send_signal(signal.SIGSTOP)
+            lives.append((life, battery))
+        time.sleep(STOPPED_S)
+        for life, battery in lives:
+            time.sleep(0.3)  # what was on the way
+            since = len(battery.estimates)
+            life.process.send_signal(signal.SIGCONT)
+            battery.wait(30)
+            again = battery.estimates[since:]
+            valid = [each for each in again if each["status"] == Status.VALID]
+            assert all(each["age_s"] < 1.0 for each in valid), valid
+            assert life.end() == 0
+            assert clean(life.text), life.text
+            assert read_state(tmp_path / life.log.stem / "cangauge-state.json").saved_s >= 0.0
+
+
+LIMIT = "import resource; resource.setrlimit(resource.RLIMIT_AS, ({0}, {0}));"
+
+
+def test_memory_limit(tmp_path: Path) -> None:
+    random, started, refused = Random(3), 0, 0  # noqa: S311 - repeatable
+    for seed in range(SEEDS):
+        folder = tmp_path / str(seed)
+        with Battery(90, DRIVE, 0.006, is_replay=True) as battery:
+            size = random.randrange(150, 1500) << 20
+            life = Life(battery, folder, code=LIMIT.format(size), **REPLAY)
+            came = waits(lambda: life.process.poll() is not None or len(battery.estimates) > 20)  # noqa: B023
+            assert came
+            if life.process.poll() is None:
+                started += 1
+                life.process.send_signal(signal.SIGHUP)
+                battery.wait(30)
+                assert life.process.poll() is None, life.text
+                assert life.end() == 0
+            else:
+                refused += 1
+                assert life.process.returncode > 0
+                assert len(life.text.splitlines()) == 1, life.text
+            assert clean(life.text), life.text
+            check_saved(folder)
+    assert started
+    assert refused
