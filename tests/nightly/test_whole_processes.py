@@ -19,31 +19,35 @@ from random import Random
 from typing import Any, Self
 
 import pytest
+from whole_processes import (
+    DRIVE,
+    LIMIT,
+    SEEDS,
+    SHIFT,
+    VEHICLE,
+    YEAR_S,
+    Life,
+    clean,
+    write_state,
+)
 
 from cangauge.bus.captures import open_capture
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocReader
 from cangauge.bus.time_source import clock_frame
-from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.offline import samples_of
-from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.judge.live import stored_logs
 from cangauge.logs.read import open_log
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.state import StateKeeper, read_state
+from cangauge.service.state import read_state
 from cangauge.settings import FrameIds
 from cangauge.types import Sample, Status
-from live import COMMAND, PATIENCE_S, leaf_model, leaf_model_path, short_log, waits
+from live import waits
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and mounts of Linux")
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="root mounts")
-SEEDS = 20
-HOUR_S, YEAR_S = 3600.0, 365.0 * 86400.0
+HOUR_S = 3600.0
 STOPPED_S = float(os.environ.get("STOPPED_S", "600"))
 """Time for which a process is stopped [s]; less for a trial."""
-VEHICLE, MODEL = Vehicle.load("generic"), leaf_model()
-DRIVE = list(samples_of(short_log(2000.0, 1.0)))
 STRETCH_S = 300
 """Bus time after which a night follows, in replays [s]: the judge keeps the stretch as a log."""
 
@@ -109,50 +113,6 @@ class Battery(threading.Thread):
         return {Status(int(each["status"])) for each in self.estimates[since:]}
 
 
-class Life:
-    """A service on a battery's bus, from its start to its end."""
-
-    def __init__(
-        self,
-        battery: Battery,
-        folder: Path,
-        *,
-        code: str = "",
-        **keys: str,
-    ) -> None:
-        port = battery.address.options["port"]
-        given = {
-            "model": f'"{leaf_model_path()}"',
-            "interface": '"udp_multicast"',
-            "channel": '"239.74.163.7"',
-            "bus_options": f"{{ port = {port} }}",
-            "state": '"cangauge-state.json"',
-            "state_every_s": "1.0",
-            "status_socket": '"off"',
-        } | keys
-        folder.mkdir(exist_ok=True)
-        self.config = folder.parent / f"{folder.name}.toml"
-        lines = [f"{key} = {value}\n" for key, value in given.items()]
-        # Paths are relative to the file, which lies beside a folder that may be full.
-        text = "".join(lines).replace('"cangauge-state.json"', f'"{folder}/cangauge-state.json"')
-        self.config.write_text(text.replace("FOLDER", str(folder)))
-        self.log = folder.parent / f"{folder.name}.txt"
-        with self.log.open("ab") as stderr:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", code + COMMAND, "run", "--config", str(self.config)],
-                stderr=stderr,
-                stdout=subprocess.DEVNULL,
-            )
-
-    @property
-    def text(self) -> str:
-        return self.log.read_text(errors="replace")
-
-    def end(self, kind: int = signal.SIGTERM) -> int:
-        self.process.send_signal(kind)
-        return self.process.wait(PATIENCE_S)
-
-
 REPLAY = {
     "time_source": '"replay-clock"',
     "judge": '{ folder = "FOLDER/judge", keep = 4 }',
@@ -174,16 +134,12 @@ def check_saved(folder: Path) -> tuple[int, int]:
     return len(stored_logs(folder / "judge")), recorded
 
 
-def clean(text: str) -> bool:
-    return "Traceback" not in text and "ERROR" not in text
-
-
 def test_kill(tmp_path: Path) -> None:
     random, folder = Random(0), tmp_path / "life"  # noqa: S311 - repeatable
     logs = 0
     with Battery(0, DRIVE, 0.006, is_replay=True) as battery:
         for _ in range(SEEDS):
-            life = Life(battery, folder, **REPLAY)
+            life = Life(battery.address, folder, **REPLAY)
             battery.wait()
             time.sleep(random.uniform(0.0, 6.0))
             life.end(signal.SIGKILL)
@@ -191,7 +147,7 @@ def test_kill(tmp_path: Path) -> None:
             assert now >= min(logs, 4)
             assert frames > 0
             logs = now
-        life = Life(battery, folder, **REPLAY)
+        life = Life(battery.address, folder, **REPLAY)
         battery.wait()
         assert life.end() == 0
     assert logs > 1
@@ -227,7 +183,7 @@ def test_disk(fault: str, tmp_path: Path) -> None:
             disk(folder, size_kb) as mount,
             Battery(20, DRIVE, 0.006, is_replay=True) as battery,
         ):
-            life = Life(battery, folder, **REPLAY)
+            life = Life(battery.address, folder, **REPLAY)
             battery.wait(20)
             time.sleep(random.uniform(0.0, 2.0))
             if fault == "read-only":
@@ -249,33 +205,14 @@ def _saved_s(folder: Path) -> float:
     return read_state(state).saved_s if state.exists() else 0.0
 
 
-def write_state(path: Path, battery: Battery, seed: int) -> None:
-    """Write the state of a drive that has ended now, from which a SoC is valid at once."""
-    seconds = 150 + 10 * seed
-    began_s = time.time() - seconds
-    settings = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0, initial_soc_std_pct=0.5))
-    pipeline, encoder = Pipeline(VEHICLE, MODEL, settings), FrameEncoder(VEHICLE)
-    path.parent.mkdir(exist_ok=True)
-    keeper = StateKeeper(path, pipeline, str(battery.address), 86400.0)
-    keeper.__enter__()
-    for sample in DRIVE[:seconds]:
-        for frame in encoder.encode(sample._replace(time_s=sample.time_s + began_s), 60.0):
-            pipeline.handle(frame)
-    assert pipeline.latest.status == Status.VALID
-    keeper.__exit__()
-
-
-SHIFT = "import time; was = time.time; time.time = lambda: was() + {};"
-
-
 @pytest.mark.parametrize("off_s", [0.0, -2.0 * YEAR_S, -HOUR_S, HOUR_S, 2.0 * YEAR_S])
 def test_clock(off_s: float, tmp_path: Path) -> None:
     for seed in range(SEEDS):
         folder = tmp_path / str(seed)
         with Battery(40, DRIVE[150 + 10 * seed :], 0.1, is_replay=False) as battery:
-            write_state(folder / "cangauge-state.json", battery, seed)
+            write_state(folder / "cangauge-state.json", battery.address, seed)
             before = (folder / "cangauge-state.json").read_bytes()
-            life = Life(battery, folder, code=SHIFT.format(off_s))
+            life = Life(battery.address, folder, code=SHIFT.format(off_s))
             battery.wait(20)
             assert life.end() == 0
             if off_s == 0.0:
@@ -297,8 +234,8 @@ def test_stopped(tmp_path: Path) -> None:
         for seed in range(SEEDS):
             drive = DRIVE[150 + 10 * seed :]
             battery = stack.enter_context(Battery(60 + seed, drive, 0.2, is_replay=False))
-            write_state(tmp_path / str(seed) / "cangauge-state.json", battery, seed)
-            life = Life(battery, tmp_path / str(seed))
+            write_state(tmp_path / str(seed) / "cangauge-state.json", battery.address, seed)
+            life = Life(battery.address, tmp_path / str(seed))
             stack.callback(life.process.kill)
             battery.wait(20)
             assert Status.VALID in battery.statuses(0)
@@ -319,16 +256,13 @@ def test_stopped(tmp_path: Path) -> None:
             assert read_state(tmp_path / life.log.stem / "cangauge-state.json").saved_s >= 0.0
 
 
-LIMIT = "import resource; resource.setrlimit(resource.RLIMIT_AS, ({0}, {0}));"
-
-
 def test_memory_limit(tmp_path: Path) -> None:
     random, started, refused = Random(3), 0, 0  # noqa: S311 - repeatable
     for seed in range(SEEDS):
         folder = tmp_path / str(seed)
         with Battery(90, DRIVE, 0.006, is_replay=True) as battery:
             size = random.randrange(150, 1500) << 20
-            life = Life(battery, folder, code=LIMIT.format(size), **REPLAY)
+            life = Life(battery.address, folder, code=LIMIT.format(size), **REPLAY)
             came = waits(lambda: life.process.poll() is not None or len(battery.estimates) > 20)  # noqa: B023
             assert came
             if life.process.poll() is None:

@@ -1,0 +1,136 @@
+"""The gateway as a process on two CAN buses, killed, stopped, starved or set to another time.
+
+Twenty seeds each: the inverter gets current frames or none, and no SoC from a state of unknown age.
+"""
+
+from __future__ import annotations
+
+import signal
+import struct
+import subprocess
+import threading
+import time
+from pathlib import Path
+from random import Random
+from typing import Self
+
+import can
+import pytest
+from whole_processes import DRIVE, LIMIT, SEEDS, SHIFT, VEHICLE, YEAR_S, Life, clean, write_state
+
+from cangauge.bus.open import BusAddress, has_socketcan
+from cangauge.extras.inverter.gateway import DOUBT_S
+from cangauge.replay.encoder import FrameEncoder
+from live import waits
+
+pytestmark = [
+    pytest.mark.socketcan,
+    pytest.mark.skipif(not has_socketcan("vcan0"), reason="no vcan0"),
+]
+OWN_PCT, EVERY_S = 11, 0.1
+
+
+class Battery(threading.Thread):
+    """Sends a drive, its own SoC (0x355) and the time (0x351) on vcan0; listens on vcan1."""
+
+    address = BusAddress("socketcan", "vcan0")
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        if not has_socketcan("vcan1"):
+            for command in ("link add vcan1 type vcan", "link set vcan1 up"):
+                subprocess.run(["ip", *command.split()], check=True)
+        self._battery, self._inverter = (
+            can.Bus(channel, interface="socketcan") for channel in ("vcan0", "vcan1")
+        )
+        self._over = threading.Event()
+        self.late_s: list[float] = []
+        self.soc_pct: list[int] = []
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+        self._battery.shutdown()
+        self._inverter.shutdown()
+
+    def run(self) -> None:
+        """Send the samples until the end."""
+        encoder, due_s = FrameEncoder(VEHICLE), time.monotonic()
+        for sample in DRIVE[150:] * 9:
+            for frame in encoder.encode(sample._replace(time_s=due_s)):
+                self._send(frame.arbitration_id, bytes(frame.data))
+            self._send(0x355, struct.pack("<2H", OWN_PCT, 99))
+            self._send(0x351, struct.pack("<d", time.monotonic()))
+            due_s += EVERY_S
+            while not self._over.is_set() and (left_s := due_s - time.monotonic()) > 0.0:
+                message = self._inverter.recv(left_s)
+                if message is not None and message.arbitration_id == 0x351:
+                    self.late_s.append(time.monotonic() - struct.unpack("<d", message.data)[0])
+                elif message is not None and message.arbitration_id == 0x355:
+                    self.soc_pct.append(struct.unpack_from("<H", message.data)[0])
+            if self._over.is_set():
+                return
+
+    def _send(self, number: int, data: bytes) -> None:
+        message = can.Message(arbitration_id=number, is_extended_id=False, data=data)
+        self._battery.send(message)
+
+    def wait(self, more: int = 5) -> None:
+        """Wait for so many further SoC at the inverter."""
+        wanted = len(self.soc_pct) + more
+        assert waits(lambda: len(self.soc_pct) >= wanted), "the inverter gets nothing"
+
+
+def gateway(battery: Battery, folder: Path, code: str = "") -> Life:
+    publish = '{ profile = "pylontech", interface = "socketcan", channel = "vcan1" }'
+    return Life(battery.address, folder, code=code, publish=publish)
+
+
+@pytest.mark.parametrize("fault", ["kill", "stop", "clock", "memory"])
+def test_gateway(fault: str, tmp_path: Path) -> None:
+    random, ended = Random(fault), 0  # noqa: S311 - repeatable
+    with Battery() as battery:
+        for seed in range(SEEDS):
+            folder, code = tmp_path / str(seed), ""
+            write_state(folder / "cangauge-state.json", battery.address, seed)
+            if fault == "clock":
+                code = SHIFT.format(random.choice([-2.0, -1e-4, 2.0]) * YEAR_S)
+            elif fault == "memory":
+                code = LIMIT.format(random.randrange(100, 600) << 20)
+            begun = len(battery.soc_pct)
+            life = gateway(battery, folder, code)
+            try:
+                waits(lambda: life.process.poll() is not None or len(battery.soc_pct) > begun + 9)  # noqa: B023
+                if life.process.poll() is not None:
+                    assert fault == "memory"
+                    assert len(life.text.splitlines()) == 1, life.text
+                    ended += 1
+                    continue
+                if fault == "clock":
+                    assert set(battery.soc_pct[begun:]) == {OWN_PCT}
+                elif fault != "memory":
+                    assert waits(lambda: battery.soc_pct[-1] != OWN_PCT, 60.0), life.text
+                time.sleep(random.uniform(0.0, 1.0))
+                if fault == "kill":
+                    life.end(signal.SIGKILL)
+                    time.sleep(0.3)
+                    gone = len(battery.soc_pct)
+                    time.sleep(0.5)
+                    assert len(battery.soc_pct) == gone
+                elif fault == "stop":
+                    life.process.send_signal(signal.SIGSTOP)
+                    time.sleep(random.uniform(2.0, 4.0))
+                    life.process.send_signal(signal.SIGCONT)
+                    battery.wait(10)
+                if fault != "kill":
+                    assert life.end() == 0
+                assert clean(life.text), life.text
+            finally:
+                life.process.kill()
+                life.process.wait()
+        assert max(battery.late_s) < DOUBT_S + 0.3
+    assert ended > 0 or fault != "memory"
