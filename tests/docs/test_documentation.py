@@ -109,3 +109,14 @@ def test_each_page_is_in_the_navigation() -> None:
     navigation = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
     for path in DOCS.rglob("*.md"):
         assert f": {path.relative_to(DOCS).as_posix()}" in navigation
+
+
+@pytest.mark.parametrize("page", ["SECURITY.md", "docs/threat-model.md", "docs/service.md"])
+def test_each_promise_names_a_test_that_exists(page: str) -> None:
+    text = (DOCS.parent / page).read_text(encoding="utf-8")
+    named = re.findall(r"`((?:tests|benchmarks)/[\w/.]+)`", text)
+    assert named
+    assert [path for path in named if not (DOCS.parent / path).exists()] == []
+    for table in re.findall(r"\| test \|\n\|[-|]+\|\n((?:\|.*\n?)+)", text):
+        for row in table.splitlines():
+            assert "`tests/" in row.rsplit("|", 2)[1], row
