@@ -223,24 +223,22 @@ static cg_real coulomb_std_pct(const cg_state *state)
                    cg_square(capacity_pct));
 }
 
-/* Charge and time since the filter's state, up to a count. */
-static cg_passed since_filter(const cg_state *state, cg_sum counted_s, cg_sum discharged_pct)
+/* Charge and time since the filter's state. */
+static void since_filter(const cg_state *state, cg_passed *passed)
 {
     const cg_memory *memory = &state->memory;
-    const cg_passed passed = {
-        cg_minus(counted_s, memory->filter_counted_s),
-        cg_minus(discharged_pct, memory->filter_discharged_pct),
-        cg_minus(state->counter.gap_var_pct2, memory->filter_gap_var_pct2),
-        R(0.0),
-    };
-    return passed;
+    const cg_counter *counter = &state->counter;
+    passed->seconds = cg_minus(counter->counted_s, memory->filter_counted_s);
+    passed->discharged_pct = cg_minus(counter->discharged_pct, memory->filter_discharged_pct);
+    passed->variance_pct2 = cg_minus(counter->gap_var_pct2, memory->filter_gap_var_pct2);
+    passed->away_s = R(0.0);
 }
 
 static cg_real filter_soc(const cg_estimator *self, cg_real *std_pct)
 {
     const cg_state *state = &self->state;
-    const cg_passed passed =
-        since_filter(state, state->counter.counted_s, state->counter.discharged_pct);
+    cg_passed passed;
+    since_filter(state, &passed);
     return cg_clip_soc(cg_filter_soc(&state->filter, self->model, &passed, std_pct));
 }
 
@@ -302,7 +300,11 @@ static void set_filter_time(cg_state *state, cg_sum counted_s, cg_sum discharged
 /* Predict the filter to a count. */
 static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
 {
-    const cg_passed passed = since_filter(&self->state, counted_s, discharged_pct);
+    const cg_memory *memory = &self->state.memory;
+    cg_passed passed;
+    since_filter(&self->state, &passed);
+    passed.seconds = cg_minus(counted_s, memory->filter_counted_s);
+    passed.discharged_pct = cg_minus(discharged_pct, memory->filter_discharged_pct);
     cg_filter_predict(&self->state.filter, self->model, &passed);
     set_filter_time(&self->state, counted_s, discharged_pct);
 }
@@ -320,17 +322,16 @@ static void test_model(cg_estimator *self, cg_time time_s)
     const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
     const cg_ekf *likelier = cg_likelier(&self->state.filter, model);
-    if (memory->innovations == model->tested_blocks) {
-        memory->innovations -= 1;
-        for (int32_t k = 0; k < memory->innovations; ++k) {
-            memory->innovation2[k] = memory->innovation2[k + 1];
-        }
-    }
-    memory->innovation2[memory->innovations] = likelier->innovation2;
-    memory->innovations += 1;
     cg_real total = R(0.0);
-    for (int32_t k = 0; k < memory->innovations; ++k) {
-        total += memory->innovation2[k];
+    cg_real newer = likelier->innovation2;
+    if (memory->innovations < model->tested_blocks) {
+        memory->innovations += 1;
+    }
+    for (int32_t k = 0; k < memory->innovations; ++k) { /* the newest is the first */
+        const cg_real here = memory->innovation2[k];
+        memory->innovation2[k] = newer;
+        total += newer;
+        newer = here;
     }
     const bool is_lasting = total > model->innovations_at_most;
     if (is_lasting || (cg_strain(likelier, model) > model->strain_at_most)) {
@@ -358,8 +359,10 @@ static void close_block(cg_estimator *self, cg_time time_s)
     cg_filter *filter = &self->state.filter;
     const cg_block *block = &self->state.block;
     const cg_real rows = (cg_real)block->rows;
-    cg_means means;
     cg_real scalars[4];
+    cg_real load[CG_LOADS];
+    cg_real drive[CG_EFFECTS];
+    cg_means means;
     if (block->is_broken || (block->rows == 0)) {
         return;
     }
@@ -370,15 +373,18 @@ static void close_block(cg_estimator *self, cg_time time_s)
     means.temperature_c = scalars[1];
     means.drop_v = scalars[2];
     means.unseen_v2 = scalars[3];
-    average(&block->sums[6], rows, cg_loads(model), means.load);
-    average(block->drive, rows, model->effects, means.drive);
+    average(&block->sums[6], rows, cg_loads(model), load);
+    average(block->drive, rows, model->effects, drive);
+    means.load = load;
+    means.drive = drive;
     propagate(self, means.counted_s, means.discharged_pct);
     const bool was_rejected = cg_filter_is_rejected(filter, model);
     cg_filter_update(filter, model, &means);
-    if (!cg_filter_is_valid(filter, model)) {
+    const bool is_lost = !cg_filter_is_valid(filter, model);
+    if (is_lost) {
         cg_filter_start(filter, model, CG_NAN, R(0.0), false);
-        memory->contradicted_until_s = time_s + cg_span(R(CONTRADICTED_S));
-    } else if (cg_filter_is_rejected(filter, model) && !was_rejected) {
+    }
+    if (is_lost || (cg_filter_is_rejected(filter, model) && !was_rejected)) {
         memory->contradicted_until_s = time_s + cg_span(R(CONTRADICTED_S));
     }
     memory->is_known = true;
@@ -408,41 +414,45 @@ static void correct(cg_estimator *self, cg_real soc_pct, cg_real std_pct)
                 cg_sqrt((R(1.0) - gain) * var_pct2));
 }
 
-static bool becomes_full(cg_estimator *self, const cg_sample *sample)
+/* Keep since when a condition has held. */
+static void note_since(cg_time *start_s, bool holds, cg_time now_s)
 {
-    const cg_settings *rule = &self->settings;
-    cg_memory *memory = &self->state.memory;
-    if (!((sample->voltage_v >= rule->full_voltage_v) &&
-          (cg_fabs(sample->current_a) <= rule->full_current_a))) {
-        if (!isnan(sample->voltage_v)) {
-            memory->full_since_s = CG_NO_TIME;
-            memory->is_full = false;
-        }
-        return false;
+    if (!holds) {
+        *start_s = CG_NO_TIME;
+    } else if (!cg_is_time(*start_s)) {
+        *start_s = now_s;
+    } else { /* as before */
     }
-    if (!cg_is_time(memory->full_since_s)) {
-        memory->full_since_s = sample->time_s;
-    }
-    const bool was_full = memory->is_full;
-    memory->is_full = cg_seconds(sample->time_s - memory->full_since_s) >= rule->full_hold_s;
-    return memory->is_full && !was_full;
+}
+
+/* Whether a condition has held for a time, as of now. */
+static bool becomes(bool *is_true, cg_time start_s, cg_time now_s, cg_real after_s)
+{
+    const bool was_true = *is_true;
+    *is_true = cg_is_time(start_s) && (cg_seconds(now_s - start_s) >= after_s);
+    return *is_true && !was_true;
 }
 
 static void use_references(cg_estimator *self, const cg_sample *sample)
 {
     const cg_settings *rule = &self->settings;
     cg_memory *memory = &self->state.memory;
-    const bool is_full = !isnan(rule->full_voltage_v) && becomes_full(self, sample);
     const cg_real newton_pct = memory->newton_pct;
+    bool becomes_full = false;
     bool becomes_rested = false;
-    if (!isnan(rule->rest_after_s) && !isnan(newton_pct)) {
-        const bool was_rested = memory->is_rested;
-        memory->is_rested =
-            cg_is_time(memory->rest_since_s) &&
-            (cg_seconds(sample->time_s - memory->rest_since_s) >= rule->rest_after_s);
-        becomes_rested = memory->is_rested && !was_rested;
+    if (!isnan(rule->full_voltage_v) && !isnan(sample->voltage_v)) {
+        note_since(&memory->full_since_s,
+                   (sample->voltage_v >= rule->full_voltage_v) &&
+                       (cg_fabs(sample->current_a) <= rule->full_current_a),
+                   sample->time_s);
+        becomes_full =
+            becomes(&memory->is_full, memory->full_since_s, sample->time_s, rule->full_hold_s);
     }
-    if (is_full) {
+    if (!isnan(rule->rest_after_s) && !isnan(newton_pct)) {
+        becomes_rested =
+            becomes(&memory->is_rested, memory->rest_since_s, sample->time_s, rule->rest_after_s);
+    }
+    if (becomes_full) {
         correct(self, rule->full_soc_pct, rule->full_soc_std_pct);
     }
     if (becomes_rested) {
@@ -481,6 +491,11 @@ static cg_real unseen_v_per_a(const cg_model *model)
     return total;
 }
 
+static bool is_outside(cg_real value, const cg_real *range)
+{
+    return (value < range[0]) || (value > range[1]);
+}
+
 /* Correlate the steps of voltage and current: of a battery they are opposite. */
 static void watch_sign(const cg_model *model, cg_memory *memory, const cg_sample *sample)
 {
@@ -503,6 +518,28 @@ static void watch_sign(const cg_model *model, cg_memory *memory, const cg_sample
                 (R(STEPS_CORRELATION) * cg_sqrt(memory->steps_v2 * memory->steps_a2)))) {
         memory->is_sign_wrong = true;
     } else { /* as before */
+    }
+}
+
+/* Compare a current beyond the fit's with the voltage: a false one has no voltage drop. */
+static void confirm_current(cg_estimator *self, const cg_sample *sample, cg_real unseen_v2)
+{
+    cg_state *state = &self->state;
+    const cg_model *model = self->model;
+    if (!is_outside(sample->current_a, model->current_range_a)) {
+        return;
+    }
+    cg_passed passed;
+    cg_means row = {0};
+    since_filter(state, &passed);
+    row.voltage_v = sample->voltage_v;
+    row.temperature_c = state->memory.temperature_c;
+    row.unseen_v2 = unseen_v2;
+    row.load = state->load;
+    row.drive = state->drive;
+    const cg_real left = cg_filter_residual(&state->filter, model, &passed, &row);
+    if (((sample->current_a > R(0.0)) ? left : -left) > model->residual_at_most) {
+        state->memory.contradicted_until_s = sample->time_s + cg_span(R(CONTRADICTED_S));
     }
 }
 
@@ -544,6 +581,7 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         add(&sums[6], state->load, cg_loads(model));
         add(state->block.drive, state->drive, model->effects);
         state->block.rows += 1;
+        confirm_current(self, sample, scalars[3]);
         watch_sign(model, memory, sample);
     }
     const cg_real soc_pct = soc_now(self, &std_pct);
@@ -556,11 +594,12 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
 }
 
 /* Follow gaps, unobserved intervals and rests. */
-static void follow(cg_estimator *self, const cg_sample *sample, const charge_step *charge)
+static void follow(cg_estimator *self, const cg_sample *sample, const charge_step *charge,
+                   bool is_gap)
 {
     const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
-    if (charge->seconds > self->settings.gap_s) {
+    if (is_gap) {
         self->state.block.is_broken = true;
         memory->row_v = CG_NAN;
         memory->gap_until_s = sample->time_s + cg_span(model->delay_s[model->delays - 1]);
@@ -569,11 +608,9 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
         propagate_to_now(self);
         be_away(self, charge->away_s, charge->parked_std_pct);
     }
-    if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
-        memory->rest_since_s = CG_NO_TIME;
-    } else if (!cg_is_time(memory->rest_since_s)) {
-        memory->rest_since_s = sample->time_s;
-    }
+    note_since(&memory->rest_since_s,
+               cg_fabs(sample->current_a) <= (R(REST_CURRENT_C_RATE) * model->capacity_ah),
+               sample->time_s);
     if (charge->seconds > R(REST_S)) {
         memory->rest_since_s = sample->time_s - cg_span(charge->seconds);
     }
@@ -602,8 +639,9 @@ static void process(cg_estimator *self, const cg_sample *sample)
     if (!isnan(sample->temperature_c) || (charge.away_s != R(0.0))) {
         memory->temperature_c = sample->temperature_c;
     }
-    cg_advance(self, sample, memory->temperature_c, charge.seconds > self->settings.gap_s);
-    follow(self, sample, &charge);
+    const bool is_gap = charge.seconds > self->settings.gap_s;
+    cg_advance(self, sample, memory->temperature_c, is_gap);
+    follow(self, sample, &charge, is_gap);
     const int64_t tick = cg_periods(since_s, R(1.0) / model->rate_hz, R(1e-6));
     if (tick > memory->tick) {
         memory->tick = tick;
@@ -614,14 +652,14 @@ static void process(cg_estimator *self, const cg_sample *sample)
 /* Replace an implausible voltage or temperature by NAN. */
 static uint32_t drop_implausible(cg_sample *sample, cg_real nominal_v)
 {
+    static const cg_real temperature_within_c[2] = {R(-60.0), R(120.0)};
+    const cg_real voltage_within_v[2] = {R(0.5) * nominal_v, R(1.5) * nominal_v};
     uint32_t reason = 0U;
-    if (!isnan(sample->voltage_v) && !(((R(0.5) * nominal_v) <= sample->voltage_v) &&
-                                       (sample->voltage_v <= (R(1.5) * nominal_v)))) {
+    if (is_outside(sample->voltage_v, voltage_within_v)) {
         sample->voltage_v = CG_NAN;
         reason = CG_IMPLAUSIBLE_INPUT;
     }
-    if (!isnan(sample->temperature_c) &&
-        !((R(-60.0) <= sample->temperature_c) && (sample->temperature_c <= R(120.0)))) {
+    if (is_outside(sample->temperature_c, temperature_within_c)) {
         sample->temperature_c = CG_NAN;
         reason = CG_IMPLAUSIBLE_INPUT;
     }
@@ -672,11 +710,6 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
 }
 
 /* ------------------------------------------------------------------ estimate */
-
-static bool is_outside(cg_real value, const cg_real *range)
-{
-    return (value < range[0]) || (value > range[1]);
-}
 
 static uint32_t reason_if(bool is_set, uint32_t reason)
 {

@@ -140,6 +140,7 @@ typedef struct {
     cg_real block_s;
     int32_t tested_blocks; /* limits of the tests for a model that the pack contradicts */
     cg_real innovations_at_most;
+    cg_real residual_at_most;
     cg_real strain_at_most;
 
     /* Principal functions of the coefficients' covariance: over SoC, and of the load columns. */
@@ -323,7 +324,7 @@ typedef struct {
     cg_time contradicted_until_s;
     cg_time mismatch_until_s;
     int32_t innovations;
-    cg_real innovation2[CG_TESTED]; /* the oldest first */
+    cg_real innovation2[CG_TESTED]; /* the newest first */
     cg_time rest_since_s;
     cg_time full_since_s;
     bool is_full;

@@ -224,27 +224,35 @@ static cg_real measurement(const cg_model *model, const cg_real *x, const observ
     return volts;
 }
 
+/* Linearise a measurement at a state: the innovation of the filter's own one and its variance. */
+static void linearise(linear *at, const cg_model *model, const cg_ekf *ekf, const cg_real *x,
+                      const observed *of)
+{
+    const int32_t size = cg_states(model);
+    cg_real noise;
+    const cg_real voltage_v = measurement(model, x, of, at->h, &noise);
+    weigh(at, ekf, size, noise);
+    at->innovation = of->block->voltage_v - voltage_v;
+    for (int32_t k = 0; k < size; ++k) {
+        at->innovation -= at->h[k] * (ekf->x[k] - x[k]);
+    }
+}
+
 /* Update with the mean voltage of a block; iterated while the SoC is uncertain. */
 static void ekf_update(const cg_model *model, cg_ekf *ekf, const observed *of)
 {
     const int32_t size = cg_states(model);
     const bool is_wide = var_of(ekf, CG_X_SOC) > cg_square(R(LINEAR_PCT));
     cg_real x[CG_STATES];
-    linear at = {{R(0.0)}, {R(0.0)}, {R(0.0)}, R(0.0), R(1.0)};
+    linear at;
     for (int32_t k = 0; k < size; ++k) {
         x[k] = ekf->x[k];
     }
-    bool is_close = false;
+    int32_t left = is_wide ? ITERATIONS_AT_MOST : 1;
     cg_real part = R(1.0);
     cg_real last_pct = R(0.0);
-    for (int32_t step = 0; (step < (is_wide ? ITERATIONS_AT_MOST : 1)) && !is_close; ++step) {
-        cg_real noise;
-        const cg_real voltage_v = measurement(model, x, of, at.h, &noise);
-        weigh(&at, ekf, size, noise);
-        at.innovation = of->block->voltage_v - voltage_v;
-        for (int32_t k = 0; k < size; ++k) {
-            at.innovation -= at.h[k] * (ekf->x[k] - x[k]);
-        }
+    do {
+        linearise(&at, model, ekf, x, of);
         const cg_real to_pct = cg_clip(ekf->x[CG_X_SOC] + (at.gain[CG_X_SOC] * at.innovation),
                                        R(LOWEST_PCT), R(HIGHEST_PCT));
         const cg_real step_pct = to_pct - x[CG_X_SOC];
@@ -256,8 +264,8 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const observed *of)
             const cg_real step_k = ekf->x[k] + (at.gain[k] * at.innovation) - x[k];
             x[k] += part * step_k;
         }
-        is_close = cg_fabs(step_pct) < R(CLOSE_PCT);
-    }
+        left = (cg_fabs(step_pct) < R(CLOSE_PCT)) ? 0 : (left - 1);
+    } while (left > 0);
     for (int32_t k = 0; k < size; ++k) {
         ekf->x[k] = x[k];
     }
@@ -391,9 +399,10 @@ void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *
     for (int32_t k = 0; k < filter->hypotheses; ++k) {
         ekf_update(model, &filter->ekf[k], &of);
     }
-    if ((filter->hypotheses == 2) && (cg_fabs(log_odds(filter, model)) > R(CLEAR_LOG_ODDS))) {
-        filter->decision = (log_odds(filter, model) > R(0.0)) ? 1 : -1;
-        if (cg_fabs(log_odds(filter, model)) > R(DROPPED_LOG_ODDS)) {
+    const cg_real odds = log_odds(filter, model);
+    if ((filter->hypotheses == 2) && (cg_fabs(odds) > R(CLEAR_LOG_ODDS))) {
+        filter->decision = (odds > R(0.0)) ? 1 : -1;
+        if (cg_fabs(odds) > R(DROPPED_LOG_ODDS)) {
             keep_likelier(filter, model);
         }
     }
@@ -444,6 +453,21 @@ cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_p
     }
     *std_pct = cg_sqrt(cg_max(variance, R(LEAST_VAR_PCT2)));
     return soc_pct;
+}
+
+/* Measured minus predicted voltage of one row over its standard deviation. */
+cg_real cg_filter_residual(const cg_filter *filter, const cg_model *model,
+                           const cg_passed *passed, const cg_means *row)
+{
+    const cg_ekf *likelier = cg_likelier(filter, model);
+    const observed of = observe(model, row);
+    cg_ekf counted = *likelier;
+    linear at;
+    cg_real var_pct2;
+    counted.x[CG_X_SOC] = soc_after(likelier, model, passed, &var_pct2);
+    linearise(&at, model, &counted, counted.x, &of);
+    return at.innovation /
+           cg_sqrt(at.variance + cg_square(of.cold * model->residual_std_v));
 }
 
 /* Whether states and variances are usable numbers. A covariance that an update makes infinite does

@@ -173,7 +173,7 @@ bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample
 void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c,
                 bool is_gap);
 
-/* Means over the rows of a block. */
+/* Means over the rows of a block, or one row. */
 typedef struct {
     cg_sum counted_s;
     cg_sum discharged_pct;
@@ -181,8 +181,8 @@ typedef struct {
     cg_real temperature_c; /* NAN: missing */
     cg_real drop_v;
     cg_real unseen_v2;
-    cg_real load[CG_LOADS];
-    cg_real drive[CG_EFFECTS];
+    const cg_real *load;
+    const cg_real *drive;
 } cg_means;
 
 /* Time in which charge was counted [s], the charge, its variance, further time without samples. */
@@ -208,6 +208,8 @@ bool cg_filter_is_plausible(const cg_filter *filter, const cg_model *model);
 bool cg_filter_is_rejected(const cg_filter *filter, const cg_model *model);
 cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_passed *passed,
                       cg_real *std_pct);
+cg_real cg_filter_residual(const cg_filter *filter, const cg_model *model,
+                           const cg_passed *passed, const cg_means *row);
 const cg_ekf *cg_likelier(const cg_filter *filter, const cg_model *model);
 cg_real cg_strain(const cg_ekf *ekf, const cg_model *model);
 

@@ -65,6 +65,7 @@ static const field MODEL_FIELDS[] = {
     REAL(cg_model, slow_time_s), REAL(cg_model, fast_std_v), REAL(cg_model, soc_std_pct),
     REAL(cg_model, cold_exponent), REAL(cg_model, residual_std_v), REAL(cg_model, block_s),
     INTEGER(cg_model, tested_blocks), REAL(cg_model, innovations_at_most),
+    REAL(cg_model, residual_at_most),
     REAL(cg_model, strain_at_most), INTEGER(cg_model, functions),
     INTEGER(cg_model, function_knots), REAL(cg_model, function_pct), TABLE(cg_model, function_v),
     TABLE(cg_model, function_slope), TABLE(cg_model, function_load), INTEGER(cg_model, effects),

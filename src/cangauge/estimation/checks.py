@@ -7,7 +7,7 @@ end of a full charge, or a long rest. Both rules are off by default.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 from scipy.special import chdtri
 
@@ -45,22 +45,26 @@ ALARM: Final = 1e-6
 """Probability that the innovations of a pack that agrees with its model fail the test."""
 
 
-def mismatch_limits(model: OnlineModel) -> tuple[int, float, float]:
-    """Return how far a pack may be from its model.
+class Limits(NamedTuple):
+    """How far a pack may be from its model."""
 
-    Returns
-    -------
-    blocks : int
-        Number of blocks tested together.
-    innovations : float
-        Largest sum of the squares of their normalised innovations.
-    strain : float
-        Largest `SocFilter.strain`: its mean under the model, less where the logs of the fit stayed
-        below it.
-    """
-    blocks = max(round(MISMATCH_S / model.noise.block_s), 1)
-    strain = (model.functions.number + 4.0) * model.noise.left_out_strain
-    return blocks, float(chdtri(blocks, ALARM)), strain
+    tested_blocks: int
+    """Number of blocks tested together."""
+    innovations_at_most: float
+    """Largest sum of the squares of their normalised innovations."""
+    residual_at_most: float
+    """Largest residual of one row over its standard deviation."""
+    strain_at_most: float
+    """Largest `SocFilter.strain`: its mean under the model, less where the logs of the fit stayed
+    below it."""
+
+    @classmethod
+    def of(cls, model: OnlineModel) -> Limits:
+        """Return the limits of a model."""
+        blocks = max(round(MISMATCH_S / model.noise.block_s), 1)
+        innovations, residual = chdtri([blocks, 1], ALARM).tolist()
+        strain = (model.functions.number + 4.0) * model.noise.left_out_strain
+        return cls(blocks, innovations, math.sqrt(residual), strain)
 
 
 def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:

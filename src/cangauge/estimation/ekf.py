@@ -229,6 +229,21 @@ class SocFilter:
         volts += float(block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:])
         return volts, H, (A * noise.fast_std_v) ** 2 + soc_axis_v**2 + block.unseen_v2
 
+    def row_residual(self, row: Block, soc_pct: float) -> float:
+        """Return measured minus predicted voltage of one row over its standard deviation.
+
+        Parameters
+        ----------
+        row : Block
+        soc_pct : float
+            SoC counted to it [%].
+        """
+        x = self.x.copy()
+        x[SOC] = soc_pct
+        voltage_v, H, R = self.measurement(x, row)
+        variance = float(H @ self.P @ H) + R + (H[SLOW] * self.model.noise.residual_std_v) ** 2
+        return (row.voltage_v - voltage_v) / math.sqrt(variance)
+
     def soc_moments_after(
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
     ) -> tuple[float, float]:

@@ -73,8 +73,8 @@ class Estimator:
     voltage_model : VoltageModel
     hypotheses : Hypotheses
         The filter, or two while a start is in doubt.
-    tests : tuple of int, float and float
-        Number of blocks tested together, and the limits of their innovations and of the strain.
+    limits : checks.Limits
+        How far the pack may be from its model.
     always : Reason
         Reasons that hold throughout.
     is_refused : bool
@@ -114,7 +114,7 @@ class Estimator:
         self._block = BlockState()
         self._memory = EstimatorMemory()
         self._power = PowerModel(self.online, self.settings.limits)
-        self.tests = checks.mismatch_limits(self.online)
+        self.limits = checks.Limits.of(self.online)
         of_model, of_input = self.model.temperature_source, self.settings.temperature_source
         is_same = "unknown" in {of_model, of_input} or of_model == of_input
         self.always = Reason.NONE if is_same else Reason.TEMPERATURE_SOURCE_MISMATCH
@@ -279,18 +279,18 @@ class Estimator:
                 memory.newton_std_pct = inverse_std_pct(
                     online, memory.newton_pct, self._temperature_c, load
                 )
-            self._block.add(
-                Block(
-                    counter.counted_s,
-                    counter.discharged_pct,
-                    sample.voltage_v,
-                    memory.temperature_c,
-                    drop_v,
-                    online.unseen_v_per_a**2 * counter.turned_a2,
-                    load,
-                    online.drives,
-                )
+            row = Block(
+                counter.counted_s,
+                counter.discharged_pct,
+                sample.voltage_v,
+                memory.temperature_c,
+                drop_v,
+                online.unseen_v_per_a**2 * counter.turned_a2,
+                load,
+                online.drives,
             )
+            self._block.add(row)
+            self._confirm_current(row, sample)
             checks.watch_sign(memory, sample, self.capacity_ah)
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
@@ -299,6 +299,20 @@ class Estimator:
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in checks.detect_references(self.settings, memory, sample):
             self._correct(*reference)
+
+    def _confirm_current(self, row: Block, sample: Sample) -> None:
+        """Compare a current beyond the fit's with the voltage: a false one has no voltage drop.
+
+        Only a voltage of a smaller current contradicts it, by more than the model's uncertainty at
+        that current.
+        """
+        if not _is_outside(sample.current_a, self.voltage_model.range.current_a):
+            return
+        likelier = self.hypotheses.likelier
+        soc_pct, _ = likelier.soc_moments_after(*self._counter.since(self._filter_at))
+        residual = likelier.row_residual(row, soc_pct)
+        if math.copysign(residual, residual * sample.current_a) > self.limits.residual_at_most:
+            self._memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
@@ -328,11 +342,11 @@ class Estimator:
         learned of the constants lies together within their priors.
         """
         memory, likelier = self._memory, self.hypotheses.likelier
-        blocks, innovations_at_most, strain_at_most = self.tests
+        limits = self.limits
         innovations = [*memory.innovations, likelier.normalised_innovation_squared]
-        memory.innovations = innovations[-blocks:]
-        is_lasting = sum(memory.innovations) > innovations_at_most
-        if is_lasting or likelier.strain() > strain_at_most:
+        memory.innovations = innovations[-limits.tested_blocks :]
+        is_lasting = sum(memory.innovations) > limits.innovations_at_most
+        if is_lasting or likelier.strain() > limits.strain_at_most:
             memory.mismatch_until_s = time_s + checks.MISMATCH_S
         if is_lasting:
             # The model may be right and the SoC wrong: charge that was not seen.
