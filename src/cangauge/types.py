@@ -86,7 +86,7 @@ REASON_WORDS: Final = {
     Reason.TEMPERATURE_OUTSIDE_MODEL: "the model was not identified at this temperature",
     Reason.CURRENT_OUTSIDE_MODEL: "the model was not identified at this current",
     Reason.TEMPERATURE_SOURCE_MISMATCH: "the temperature is not measured where the model's was",
-    Reason.INNOVATION_LARGE: "the voltage rejected the SoC or a high current, or the filter restarted",
+    Reason.INNOVATION_LARGE: "the voltage rejected SoC or high current, or the filter restarted",
     Reason.NO_INITIAL_SOC: "the SoC is not known yet",
     Reason.INPUT_STALE: "no usable sample within the time-out",
     Reason.IMPLAUSIBLE_INPUT: "a value was refused: out of range, or changed too fast",
