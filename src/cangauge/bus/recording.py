@@ -33,13 +33,12 @@ from cangauge.bus.readers import PAUSE_S
 from cangauge.bus.time_source import ReplayClock, frames_of_buses, time_source
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.errors import InputError, require_temperature
+from cangauge.logs.agreement import WRAPPED, agreeing
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log
 from cangauge.logs.quantities import known_temperature_source
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
-from cangauge.logs.sign import resolve_sign
-from cangauge.logs.wrong_units import WRAPPED, refuse_wrong_units
+from cangauge.logs.sign import Sign
 from cangauge.settings import TemperatureSource, TimeSourceName
 from cangauge.types import Sample
 
@@ -415,10 +414,9 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     names = {LOG_COLUMNS[each.role]: each.codec.name for each in vehicle.signals}
     labels = {"time_s": "time stamps", **names}
     try:
-        refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
+        return agreeing(log, labels=labels, in_seconds=True)
     except InputError as error:
         raise _of_capture(error, vehicle) from error
-    return resolve_sign(log, stored_sign_unknown=False)
 
 
 def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:

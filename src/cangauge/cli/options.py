@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from cangauge.bus.captures import Capture
     from cangauge.bus.vehicle import Vehicle
     from cangauge.logs.column_map import ColumnMap
-    from cangauge.logs.draft import Sign
     from cangauge.logs.log import Log
     from cangauge.logs.read import CellColumns, LogFile
+    from cangauge.logs.sign import Sign
 
 # The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
 

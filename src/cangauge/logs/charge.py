@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, permutations
+from itertools import combinations, pairwise
 from operator import itemgetter
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -47,9 +47,14 @@ class ImpliedCapacity:
     capacity_ah: float
     std_ah: float
 
+    def contradicts(self, other_ah: float) -> bool:
+        """Return whether another capacity [Ah] differs by a factor of two, beyond the error."""
+        least_ah = self.capacity_ah - SURE * self.std_ah
+        most_ah = self.capacity_ah + SURE * self.std_ah
+        return least_ah > CONTRADICTION * other_ah or CONTRADICTION * most_ah < other_ah
 
-@dataclass(frozen=True, slots=True)
-class _Count:
+
+class _Count(NamedTuple):
     """SoC [%] without jumps and discharged charge [Ah] at the rows with a SoC, shape (k,).
 
     `std_ah` is the error of the charge by sampling, `step_pct` the resolution of the SoC.
@@ -64,22 +69,15 @@ class _Count:
     def span_pct(self) -> float:
         return float(np.ptp(self.soc_pct))
 
-    def covariance(self) -> tuple[float, float]:
-        """Return covariance of SoC and charge, and variance of the SoC, both times k."""
-        away_pct = self.soc_pct - self.soc_pct.mean()
-        covariance = float(np.sum(away_pct * (self.out_ah - self.out_ah.mean())))
-        return covariance, float(np.sum(away_pct**2))
+    def part(self, first: int, end: int) -> _Count:
+        """Return the rows from `first` to the one before `end`."""
+        return self._replace(soc_pct=self.soc_pct[first:end], out_ah=self.out_ah[first:end])
 
     def halves(self) -> tuple[_Count, _Count]:
         """Return the parts before and after half of the movement of the SoC."""
         moved_pct = np.cumsum(np.abs(np.diff(self.soc_pct)))
         middle = 1 + int(np.searchsorted(moved_pct, 0.5 * moved_pct[-1]))
-        return self.part(0, middle + 1), self.part(middle, len(self.soc_pct))
-
-    def part(self, first: int, end: int) -> _Count:
-        """Return the rows from `first` to the one before `end`."""
-        rows = slice(first, end)
-        return _Count(self.soc_pct[rows], self.out_ah[rows], self.std_ah, self.step_pct)
+        return self.part(0, middle + 1), self.part(middle, self.soc_pct.size)
 
 
 def implied_capacity(logs: Sequence[Log], least_pct: float = MIN_SPAN_PCT) -> ImpliedCapacity:
@@ -120,21 +118,20 @@ def contradiction(log: Log, capacity_ah: float | None = None) -> str | None:
     whole = _implied(counts)
     if whole is None:
         return None
-    begins = "charge and SoC contradict each other"
-    if capacity_ah is not None and _contradict(whole, capacity_ah):
+    problem = "charge and SoC contradict each other: {} Ah per 100 %"
+    if capacity_ah is not None and whole.contradicts(capacity_ah):
         stated = f"the pack has {rounded(capacity_ah, 3)} Ah"
-        return f"{begins}: {_per_100(whole.capacity_ah)}; {stated}"
+        return f"{problem.format(rounded(whole.capacity_ah, 3))}; {stated}"
     halves = [half for count in counts for half in count.halves() if half.span_pct >= MIN_SPAN_PCT]
     moved_pct = np.cumsum([half.span_pct for half in halves])
     middle = min(int(np.sum(moved_pct < 0.5 * moved_pct[-1:])) + 1, len(halves) - 1)
-    parts = [found for half in (halves[:middle], halves[middle:]) if (found := _implied(half))]
-    for first, second in pairwise(parts):
-        if _contradict(first, second.capacity_ah) and _contradict(second, first.capacity_ah):
-            return (
-                f"{begins}: {_per_100(first.capacity_ah)} in one part of the log,"
-                f" {rounded(second.capacity_ah, 3)} Ah in the next"
-            )
-    return None
+    first, second = _implied(halves[:middle]), _implied(halves[middle:])
+    if first is None or second is None:
+        return None
+    if not (first.contradicts(second.capacity_ah) and second.contradicts(first.capacity_ah)):
+        return None
+    parts = f"in one part of the log, {rounded(second.capacity_ah, 3)} Ah in the next"
+    return f"{problem.format(rounded(first.capacity_ah, 3))} {parts}"
 
 
 def refuse_contradictions(logs: Sequence[Log], capacity_ah: float | None = None) -> None:
@@ -149,7 +146,7 @@ def refuse_contradictions(logs: Sequence[Log], capacity_ah: float | None = None)
 def with_own_count(log: Log, counters: Mapping[str, FloatArray]) -> Log:
     """Return a log with the charge that its own counter states, if one of its columns is one.
 
-    A column, or the difference of two (discharged less charged), is the counter if it agrees with
+    A column, or the difference of two (discharged and charged), is the counter if it agrees with
     the charge that the current gives, within the error of momentary currents.
 
     Parameters
@@ -159,54 +156,47 @@ def with_own_count(log: Log, counters: Mapping[str, FloatArray]) -> Log:
         Columns in Ah by their headings, shape (n,).
     """
     out_ah = discharged_ah(log.time_s, log.current_a)
-    least_ah = SURE * _sampling_std_ah(log) + COUNTER_SHARE * float(np.ptp(out_ah))
-    counts = dict(counters)
-    for one, other in permutations(counters, 2):
-        counts[f"{one} − {other}"] = counters[one] - counters[other]
-    moved: list[tuple[float, str, FloatArray]] = []
+    counts = {label: count for label, count in counters.items() if np.isfinite(count).all()}
+    for one, other in combinations([*counts], 2):
+        counts[f"{one} − {other}"] = counts[one] - counts[other]
+    found: list[tuple[float, str, FloatArray]] = []
     for label, count in counts.items():
         gained_ah = count - count[0]
         if np.sum(gained_ah * out_ah) < 0.0:
             gained_ah = -gained_ah
-        if np.ptp(gained_ah) > 0.0:
-            moved.append((float(np.max(np.abs(gained_ah - out_ah))), label, gained_ah))
-    if not moved:
+        if np.any(gained_ah):
+            found.append((float(np.max(np.abs(gained_ah - out_ah))), label, gained_ah))
+    if not found:
         return log
-    apart_ah, label, counted_ah = min(moved, key=itemgetter(0))
-    if apart_ah <= least_ah:
+    apart_ah, label, counted_ah = min(found, key=itemgetter(0))
+    moved_ah = float(np.ptp(out_ah))
+    if apart_ah <= SURE * _sampling_std_ah(log) + COUNTER_SHARE * moved_ah:
         remark = f'charge for the capacity: counted by "{label}"'
         return replace(log, counted_ah=counted_ah, remarks=(*log.remarks, remark))
     remark = (
         f'no column in Ah counts this current: the nearest, "{label}", is up to'
-        f" {rounded(apart_ah, 2)} Ah off, and the current moves {rounded(np.ptp(out_ah), 3)} Ah"
+        f" {rounded(apart_ah, 2)} Ah off, and the current moves {rounded(moved_ah, 3)} Ah"
     )
     return replace(log, remarks=(*log.remarks, remark))
 
 
-def _per_100(capacity_ah: float) -> str:
-    return f"{rounded(capacity_ah, 3)} Ah per 100 %"
-
-
-def _contradict(implied: ImpliedCapacity, other_ah: float) -> bool:
-    """Return whether a capacity is another one by a factor of two, whatever its sampling error."""
-    least_ah = implied.capacity_ah - SURE * implied.std_ah
-    most_ah = implied.capacity_ah + SURE * implied.std_ah
-    return least_ah > CONTRADICTION * other_ah or CONTRADICTION * most_ah < other_ah
-
-
 def _implied(counts: Sequence[_Count]) -> ImpliedCapacity | None:
-    sums = [count.covariance() for count in counts]
-    covariance, variance = (sum(column) for column in zip(*sums, strict=True)) if sums else (0, 0)
+    """Return the capacity by regression pooled over counts; None if no SoC moves in them."""
+    covariance = variance = 0.0
+    for count in counts:
+        away_pct = count.soc_pct - count.soc_pct.mean()
+        covariance += float(np.sum(away_pct * (count.out_ah - count.out_ah.mean())))
+        variance += float(np.sum(away_pct**2))
     if not variance:
         return None
     capacity_ah = -100.0 * covariance / variance
     charge_ah = sum(float(np.ptp(count.out_ah)) for count in counts)
     span_pct = sum(count.span_pct for count in counts)
-    by_sampling_ah = float(np.sqrt(sum(count.std_ah**2 for count in counts)))
+    by_sampling_ah = math.sqrt(sum(count.std_ah**2 for count in counts))
     # Two roundings, of the first value and of the last.
-    by_steps_pct = float(np.sqrt(sum(count.step_pct**2 for count in counts) / 6.0))
-    share = np.hypot(by_sampling_ah / charge_ah if charge_ah else 0.0, by_steps_pct / span_pct)
-    return ImpliedCapacity(capacity_ah, abs(capacity_ah) * float(share))
+    by_steps_pct = math.sqrt(sum(count.step_pct**2 for count in counts) / 6.0)
+    share = math.hypot(by_sampling_ah / charge_ah if charge_ah else 0.0, by_steps_pct / span_pct)
+    return ImpliedCapacity(capacity_ah, abs(capacity_ah) * share)
 
 
 def _counts(log: Log, least_pct: float, *, at_ends: bool = True) -> Iterator[_Count]:
@@ -217,30 +207,31 @@ def _counts(log: Log, least_pct: float, *, at_ends: bool = True) -> Iterator[_Co
     while the SoC stands at 0 or 100 % is left out: a gauge that is off stands there.
     """
     for piece in split_where_moved(log):
-        soc_pct = np.full(len(piece), np.nan) if piece.soc_pct is None else piece.soc_pct
-        rows = np.isfinite(soc_pct)
-        steps = np.abs(np.diff(soc_pct[rows]))
+        if piece.soc_pct is None:
+            return
+        rows = np.isfinite(piece.soc_pct)
+        soc_pct, time_s = piece.soc_pct[rows], piece.time_s[rows]
+        steps = np.abs(np.diff(soc_pct))
         if not np.any(steps > 0.0):
             continue
         step_pct = float(np.median(steps[steps > 0.0]))
-        known_pct = _without_jumps(soc_pct[rows], step_pct)
-        if piece.counted_ah is not None:
-            out_ah, std_ah = piece.counted_ah[rows], 0.0
-        else:
-            out_ah = discharged_ah(piece.time_s, piece.current_a)[rows]
+        out_ah, std_ah = piece.counted_ah, 0.0
+        if out_ah is None:
+            out_ah = discharged_ah(piece.time_s, piece.current_a)
             std_ah = _sampling_std_ah(piece)
+        out_ah = out_ah[rows]
         if not at_ends:
-            is_end = (soc_pct[rows][1:] <= 0.0) | (soc_pct[rows][1:] >= 100.0)
-            out_ah = np.cumsum(np.where(is_end & (steps == 0.0), 0.0, np.diff(out_ah)))
-            out_ah = np.concatenate([[0.0], out_ah])
-        whole = _Count(known_pct, out_ah, std_ah, step_pct)
+            is_end = (soc_pct[1:] <= 0.0) | (soc_pct[1:] >= 100.0)
+            counted_ah = np.where(is_end & (steps == 0.0), 0.0, np.diff(out_ah))
+            out_ah = np.concatenate([[0.0], np.cumsum(counted_ah)])
+        whole = _Count(_without_jumps(soc_pct, step_pct), out_ah, std_ah, step_pct)
         day_s, _ = QUANTITIES["time"].units["d"]
-        days = np.unique((piece.time_s[rows] - piece.time_s[0]) // day_s, return_index=True)[1]
-        parts = [whole.part(*ends) for ends in pairwise([*days.tolist(), len(known_pct)])]
+        days = np.unique((time_s - piece.time_s[0]) // day_s, return_index=True)[1].tolist()
+        parts = [whole.part(*ends) for ends in pairwise([*days, soc_pct.size])]
         moved = [part for part in parts if part.span_pct >= least_pct]
         if len(parts) > 1 and moved:
             share = math.sqrt(1.0 / len(parts))
-            yield from (replace(part, std_ah=share * std_ah) for part in moved)
+            yield from (part._replace(std_ah=share * std_ah) for part in moved)
         elif whole.span_pct >= least_pct:
             yield whole
 
@@ -259,11 +250,8 @@ def _sampling_std_ah(log: Log) -> float:
     A current that is independent from row to row deviates from the mean of its neighbours by
     sqrt(3/2) of its standard deviation; each row stands for half of the two steps beside it.
     """
-    if len(log) < 3:
-        return 0.0
     step_s = np.diff(log.time_s)
     step_s[step_s > bridge_s(log.time_s)] = 0.0
-    current = log.current_a
-    apart_a = current[1:-1] - 0.5 * (current[:-2] + current[2:])
+    apart_a = log.current_a[1:-1] - 0.5 * (log.current_a[:-2] + log.current_a[2:])
     stands_for_s = 0.5 * (step_s[:-1] + step_s[1:])
     return float(np.sqrt(np.sum((apart_a * stands_for_s) ** 2) / 1.5) / 3600.0)

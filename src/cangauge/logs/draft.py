@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.charge import with_own_count
+from cangauge.logs.agreement import agreeing
 from cangauge.logs.columns import shown_headings
 from cangauge.logs.headings import Rank, cell_number, meaning_of
 from cangauge.logs.log import Log
 from cangauge.logs.quantities import REQUIRED, known_temperature_source
-from cangauge.logs.sign import resolve_sign
-from cangauge.logs.wrong_units import refuse_wrong_units
+from cangauge.logs.sign import Sign, SignSource
 from cangauge.settings import TemperatureSource
 from cangauge.types import SOC_WITHIN_PCT
-
-Sign = Literal["charge", "discharge"]
-"""What a positive current in the file does."""
 
 COUNTER: Final = "#"
 """Begins the name of a value that may count the charge [Ah]; its heading follows."""
@@ -48,11 +44,12 @@ class DraftLog:
         Arrays of shape (n,) in canonical units (positive current discharges), and headings.
     temperature_source : str
         Location of the temperature sensor.
-    sign_unknown, negated : bool
-        The format does not define the sign; the file stores discharge as negative.
+    sign_by : {"format", "user", "data"}
+        What tells the sign of the current.
+    negated : bool
+        The file stores discharge as negative.
     in_seconds, stated
-        Whether a unit of time is stated, and columns whose unit the user states; see
-        `refuse_wrong_units`.
+        Whether a unit of time is stated, and columns whose unit the user states; see `agreeing`.
     assumed, remarks : list of str
         How the columns were understood; changes and findings.
     headings, ignored : tuple of str
@@ -64,7 +61,7 @@ class DraftLog:
     values: dict[str, FloatArray] = field(default_factory=dict)
     labels: dict[str, str] = field(default_factory=dict)
     temperature_source: TemperatureSource = "unknown"
-    sign_unknown: bool = False
+    sign_by: SignSource = "format"
     negated: bool = False
     in_seconds: bool | None = False
     stated: set[str] = field(default_factory=set)
@@ -122,7 +119,7 @@ class DraftLog:
                 raise InputError("not a sign", field="--sign", value=sign, cure=cure)
             if (sign == "charge") is not self.negated:
                 self.negate_current(f"positive {sign}s in the file, as stated")
-            self.sign_unknown = False
+            self.sign_by = "user"
         if not self.values["time_s"].size:
             raise InputError("the log holds no rows", source=self.where, cure="check the export")
         self._remark_ignored()
@@ -136,29 +133,23 @@ class DraftLog:
         self._remark_values()
         for values in self.values.values():
             values.flags.writeable = False  # the log need not copy them
-        self.remarks += refuse_wrong_units(
-            self.values,
-            source=self.where,
-            labels=self.labels,
-            in_seconds=self.in_seconds,
-            stated=self.stated,
-        )
-        channels = {name: each for name, each in self.values.items() if name[:1] != COUNTER}
+        columns = {name: each for name, each in self.values.items() if name[:1] != COUNTER}
         log = Log(
-            **channels,
+            **columns,
             name=self.name,
             source=self.source,
             temperature_source=self.temperature_source,
             remarks=tuple(self.remarks),
             assumed=tuple(self.assumed),
         )
-        log = resolve_sign(log, stored_sign_unknown=self.sign_unknown, is_stated=sign is not None)
-        counters = {
-            name[1:]: each
-            for name, each in self.values.items()
-            if name[:1] == COUNTER and np.isfinite(each).all()
-        }
-        return with_own_count(log, counters) if counters and log.soc_pct is not None else log
+        return agreeing(
+            log,
+            labels=self.labels,
+            in_seconds=self.in_seconds,
+            stated=self.stated,
+            sign_by=self.sign_by,
+            counters={name[1:]: each for name, each in self.values.items() if name not in columns},
+        )
 
     def _remark_ignored(self) -> None:
         cells = [name for name in self.ignored if cell_number(name) is not None]

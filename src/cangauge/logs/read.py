@@ -19,11 +19,12 @@ from cangauge.errors import InputError, require_temperature
 from cangauge.logs.canonical import parquet_table, table_of_schema
 from cangauge.logs.column_map import DOCS, ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
-from cangauge.logs.draft import DraftLog, Sign
+from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.proposals import proposing
 from cangauge.logs.quantities import FIELDS
+from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
 from cangauge.logs.values import is_number, numbers_of, with_decimal_points

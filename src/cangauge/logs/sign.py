@@ -1,6 +1,14 @@
-"""Determine the sign of current from the data: positive should discharge.
+"""The sign of current of a log: positive discharges.
 
-Three kinds of evidence:
+What tells it, the first that does:
+
+1. the user (`--sign`, or the factor of the column), or the format;
+2. of a current that is never negative, a column of words that says when it charges
+   (`table.direct_by_state`);
+3. the data (`sign_of_current`), where `agreement` inverts a sign that nothing else tells, and
+   remarks on one that the data contradict.
+
+Three kinds of evidence are in the data:
 
 - **steps**: when current rises by a step, the voltage of a discharging battery falls (ohmic drop).
   Every clear step is a vote; a sign test gives the probability of the votes by chance.
@@ -14,8 +22,8 @@ findings and is not a measured frequency; weights are capped, so that no kind ov
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from scipy import special
@@ -25,6 +33,11 @@ from cangauge.errors import InputError
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.logs.quantities import LIMITS
+
+Sign = Literal["charge", "discharge"]
+"""What a positive current in the file does."""
+SignSource = Literal["format", "user", "data"]
+"""What tells the sign of a log's current."""
 
 STEP_SPACING_S: Final = 1.0
 """Time between the rows whose difference is a step [s]."""
@@ -65,6 +78,19 @@ class SignFinding:
     confidence: float
     evidence: tuple[SignEvidence, ...]
 
+    @classmethod
+    def of(cls, evidence: Sequence[SignEvidence]) -> Self:
+        """Return the sign that evidence shows: open if it is weak, or part of it opposes."""
+        weight = sum(each.weight for each in evidence)
+        is_opposed = any(
+            item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence
+        )
+        sign: Literal[1, -1, 0] = 1 if weight > 0.0 else -1
+        if abs(weight) < _SURE_WEIGHT or is_opposed:
+            sign = 0
+        odds = 10.0 ** abs(weight)
+        return cls(sign, min(float(odds / (1.0 + odds)), 0.9999), tuple(evidence))
+
     @property
     def strongest(self) -> SignEvidence:
         """The strongest evidence for the finding."""
@@ -89,16 +115,7 @@ class SignFinding:
 def sign_of_current(log: Log) -> SignFinding:
     """Determine from the data whether positive current discharges; either sign is accepted."""
     taken_ah = discharged_ah(log.time_s, log.current_a)
-    return _finding((_from_steps(log), _from_charge(log, taken_ah), _from_soc(log, taken_ah)))
-
-
-def _finding(evidence: Sequence[SignEvidence]) -> SignFinding:
-    weight = sum(item.weight for item in evidence)
-    opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)
-    sure = abs(weight) >= _SURE_WEIGHT and not opposed
-    odds = 10.0 ** abs(weight)
-    sign: Literal[1, -1, 0] = (1 if weight > 0.0 else -1) if sure else 0
-    return SignFinding(sign, min(float(odds / (1.0 + odds)), 0.9999), tuple(evidence))
+    return SignFinding.of((_steps(log), _charge(log, taken_ah), _soc(log, taken_ah)))
 
 
 def require_discharge_positive(log: Log, *, is_capture: bool = False) -> None:
@@ -117,53 +134,54 @@ def require_discharge_positive(log: Log, *, is_capture: bool = False) -> None:
 def current_steps(log: Log) -> tuple[FloatArray, FloatArray]:
     """Return the clear steps, at most 400 of the largest: changes of current [A], voltage [V]."""
     rows = spaced_rows(log.time_s, STEP_SPACING_S)
-    change = np.diff(log.current_a[rows])
-    near = np.diff(log.time_s[rows]) <= LIMITS["interval_s"]
-    clear = np.abs(change) >= _STEP_SHARE * np.ptp(log.current_a)
-    chosen = np.flatnonzero(near & clear & (change != 0.0))
-    if chosen.size > _MAX_STEPS:
-        chosen = chosen[np.argpartition(-np.abs(change[chosen]), _MAX_STEPS)[:_MAX_STEPS]]
-    return change[chosen], np.diff(log.voltage_v[rows])[chosen]
+    change_a = np.diff(log.current_a[rows])
+    is_near = np.diff(log.time_s[rows]) <= LIMITS["interval_s"]
+    is_clear = np.abs(change_a) >= _STEP_SHARE * np.ptp(log.current_a)
+    steps = np.flatnonzero(is_near & is_clear & (change_a != 0.0))
+    if steps.size > _MAX_STEPS:
+        steps = steps[np.argpartition(-np.abs(change_a[steps]), _MAX_STEPS)[:_MAX_STEPS]]
+    return change_a[steps], np.diff(log.voltage_v[rows])[steps]
 
 
-def _from_steps(log: Log) -> SignEvidence:
-    current, voltage = current_steps(log)
-    votes = -np.sign(current * voltage)
+def _steps(log: Log) -> SignEvidence:
+    current_a, voltage_v = current_steps(log)
+    votes = -np.sign(current_a * voltage_v)
     fell, rose = int((votes > 0).sum()), int((votes < 0).sum())
     if not fell + rose:
         return SignEvidence("steps", 0.0, "no clear step of current")
-    way, larger = ("against", fell) if fell >= rose else ("with", rose)
+    way, larger, sign = ("against", fell, 1.0) if fell >= rose else ("with", rose, -1.0)
     share = larger / (fell + rose)
     # Successive steps share slow voltage changes: they are fewer independent votes.
     free = max(1, round((fell + rose) / _VOTES_PER_FREE_ONE))
     chance = 2.0 * float(special.bdtrc(round(share * free) - 1, free, 0.5))
     weight = min(6.0, -float(np.log10(chance))) if share >= _CLEAR_SHARE and chance < 1.0 else 0.0
     text = f"voltage moved {way} current in {larger} of {fell + rose} steps"
-    return SignEvidence("steps", weight if fell >= rose else -weight, text)
+    return SignEvidence("steps", sign * weight, text)
 
 
-def _from_charge(log: Log, taken_ah: FloatArray) -> SignEvidence:
+def _charge(log: Log, taken_ah: FloatArray) -> SignEvidence:
     rows = spaced_rows(log.time_s, log.duration_s / 200.0)
     voltage, taken = log.voltage_v[rows], taken_ah[rows]
-    span = float(np.ptp(voltage))
-    if rows.size < 20 or np.ptp(taken) <= 0.0 or span <= 0.0:
+    span_v = float(np.ptp(voltage))
+    if rows.size < 20 or np.ptp(taken) <= 0.0 or span_v <= 0.0:
         return SignEvidence("charge", 0.0, "no voltage trend over charge")
     rank = correlation(_ranks(taken), _ranks(voltage))
-    clear = span >= 0.05 * float(np.median(log.voltage_v))
     weight = 3.0 if abs(rank) >= 0.9 else 1.5 if abs(rank) >= 0.7 else 0.0
+    if span_v < 0.05 * float(np.median(log.voltage_v)):
+        weight = 0.0
     text = f"voltage against charge taken out: rank correlation {rank:+.2f}"
-    return SignEvidence("charge", -float(np.sign(rank)) * (weight if clear else 0.0), text)
+    return SignEvidence("charge", -float(np.sign(rank)) * weight, text)
 
 
-def _from_soc(log: Log, taken_ah: FloatArray) -> SignEvidence:
+def _soc(log: Log, taken_ah: FloatArray) -> SignEvidence:
     if log.soc_pct is None:
         return SignEvidence("soc", 0.0, "no reference SoC")
     known = np.flatnonzero(np.isfinite(log.soc_pct))
-    soc, taken = log.soc_pct[known], taken_ah[known]
-    span = float(np.ptp(soc)) if known.size > 10 else 0.0
-    if span < 1.0 or np.ptp(taken) <= 0.0:
-        return SignEvidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
-    alike = correlation(taken, soc)
+    span_pct = float(np.ptp(log.soc_pct[known])) if known.size > 10 else 0.0
+    if span_pct < 1.0 or np.ptp(taken_ah[known]) <= 0.0:
+        return SignEvidence("soc", 0.0, f"reference SoC moves by only {span_pct:.1f} %")
+    rows = known[:: 1 + known.size // 100_000]  # more rows show no more, and take memory
+    alike = correlation(taken_ah[rows], log.soc_pct[rows])
     weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
     way = "rises" if alike > 0.0 else "falls"
     text = f"reference SoC {way} as charge is taken out, correlation {alike:.2f}"
@@ -190,36 +208,3 @@ def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
         return np.zeros(1, dtype=np.intp)
     slot = np.floor((time_s - time_s[0]) / spacing_s)
     return np.concatenate(([0], np.flatnonzero(np.diff(slot) > 0.0) + 1)).astype(np.intp)
-
-
-def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False) -> Log:
-    """Check the sign of current against the data; invert it only where the format leaves it open.
-
-    A remark says where the data disagree with the sign (`is_stated` by the user), or cannot confirm
-    one that the format does not define. A SoC that contradicts the sign which the voltage alone
-    proves is left out.
-    """
-    finding = sign_of_current(log)
-    remarks = list(log.remarks)
-    voltage, soc = _finding(finding.evidence[:2]), finding.evidence[2]
-    contradicts = abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0
-    if log.soc_pct is not None and not finding.sign and contradicts:
-        first, last = log.soc_pct[np.isfinite(log.soc_pct)][[0, -1]]
-        why = f"by the sign of current that the voltage proves ({voltage.strongest.text})"
-        moves = f"it moves from {first:.4g} to {last:.4g} % against the charge, {why}"
-        remarks.append(f"SoC left out: {moves}; is it a depth of discharge?")
-        log, finding = replace(log, soc_pct=None), voltage
-    if stored_sign_unknown and log.assumed:
-        way = "charges" if finding.sign < 0 else "discharges"
-        how = "found from the data" if finding.sign else "not confirmed by the data"
-        log = replace(log, assumed=(*log.assumed, f"positive current {way}, {how}"))
-    if stored_sign_unknown and finding.sign < 0:
-        log = replace(log, current_a=0.0 - log.current_a)
-        remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
-    elif finding.sign < 0:
-        what, how = ("the stated sign of current", "stated") if is_stated else ("current", "stored")
-        remarks.append(f"{what} looks inverted and was kept as {how}: {finding.sentence}")
-    elif stored_sign_unknown and not finding.sign:
-        remark = "sign of current unknown and undetermined by the data: kept as stored"
-        remarks.append(f"{remark} (--sign charge inverts it)")
-    return replace(log, remarks=tuple(remarks))

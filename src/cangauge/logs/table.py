@@ -136,9 +136,10 @@ def draft_of_table(
     draft.temperature_source = known_temperature_source(word, source=where)
     if not choice.is_canonical:
         current = chosen["current"]
-        draft.sign_unknown = current.factor > 0.0 and len(current.places) == 1
-        if draft.sign_unknown and not np.any(draft.values["current_a"] < 0.0):
-            _sign_by_state(draft, table)
+        if current.factor > 0.0 and len(current.places) == 1:
+            draft.sign_by = "data"
+            if not np.any(draft.values["current_a"] < 0.0):
+                direct_by_state(draft, table)
         _hold_changes(draft)
     return draft
 
@@ -206,7 +207,7 @@ def _discharge_less_charge(draft: DraftLog, parts: Sequence[FloatArray]) -> Floa
     return np.abs(parts[0]) - np.abs(parts[1])
 
 
-def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
+def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
     """Make an unsigned current negative where a column of words says that it charges.
 
     Raises
@@ -237,7 +238,7 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
             cure = "write it as charge or discharge, or give the current a sign"
             raise draft.error(headings[place], problem, cure, cells[row].as_py())
         draft.values["current_a"] = np.where(charges, -current, current)
-        draft.sign_unknown = False
+        draft.sign_by = "format"
         draft.assumed.append(f'current charges where "{headings[place]}" says so')
         return
 

@@ -232,7 +232,8 @@ def _take_pair(
         _take(draft, quantity, column, values)
         if instrument:
             draft.remarks.append(f"{quantity} from the {instrument}")
-        draft.sign_unknown |= quantity == "current_a" and instrument == _CAN
+        if quantity == "current_a" and instrument == _CAN:
+            draft.sign_by = "data"
 
 
 _DRIVING: Final = REQUIRED[1:3]

@@ -1,0 +1,384 @@
+"""Whether current, voltage, temperature, SoC and time of a log agree in size and sign.
+
+`agreeing` is the one check. Its hypotheses are of three kinds:
+
+- **unit or column**: the sizes of all columns fit another unit, a swap of two, or a
+  field that wraps. The log is refused, with the unit to state;
+- **sign** (`sign`): the current charges. It is inverted where nothing but the data tells its sign;
+- **own charge column** (`charge`): one of the columns in Ah counts the current.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from cangauge._typing import BoolArray, FloatArray
+from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
+from cangauge.logs.charge import implied_capacity, with_own_count
+from cangauge.logs.log import Log
+from cangauge.logs.quantities import LIMITS, QUANTITIES
+from cangauge.logs.resolution import wrapped_current
+from cangauge.logs.sign import SignFinding, SignSource, sign_of_current
+
+_TIME_UNITS: Final = {
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+    "min": "minutes",
+    "h": "hours",
+    "d": "days (dates of a spreadsheet)",
+}
+WRAPPED: Final = "a signed value was read as unsigned"
+"""What is wrong with a current of one sign that wraps."""
+
+
+_Hypothesis = tuple[bool | np.bool, float, str, str, Sequence[str]]
+"""Whether something is wrong, by which value, the problem, the cure, and units to state instead."""
+
+
+def agreeing(
+    log: Log,
+    *,
+    labels: Mapping[str, str],
+    in_seconds: bool | None = False,
+    stated: Collection[str] = (),
+    sign_by: SignSource = "format",
+    counters: Mapping[str, FloatArray] | None = None,
+) -> Log:
+    """Return a log whose columns agree, with its sign, its own charge column and remarks.
+
+    Parameters
+    ----------
+    log : Log
+    labels : mapping
+        Headings by canonical column, for messages.
+    in_seconds : bool, optional
+        Whether the unit of time is fixed, as that of a capture or of dates: rows may then be as
+        close as an accelerated replay makes them. None: nothing states it.
+    stated : collection of str
+        Columns whose unit the user states.
+    sign_by : {"format", "user", "data"}
+        What tells the sign of the current.
+    counters : mapping, optional
+        Columns in Ah by their headings, shape (n,).
+
+    Raises
+    ------
+    InputError
+        If a column cannot be in its canonical unit.
+    """
+    log = _in_canonical_units(log, labels, in_seconds, stated)
+    log = _discharging(log, sign_by)
+    return with_own_count(log, counters) if counters and log.soc_pct is not None else log
+
+
+# --- Sign
+
+
+def _discharging(log: Log, sign_by: SignSource) -> Log:
+    """Return a log whose sign of current is that of the data if these tell it; remark on doubts.
+
+    A SoC that contradicts the sign which the voltage alone proves is left out.
+    """
+    finding, is_open = sign_of_current(log), sign_by == "data"
+    voltage, soc = SignFinding.of(finding.evidence[:2]), finding.evidence[2]
+    remarks, assumed, current_a = [*log.remarks], [*log.assumed], log.current_a
+    soc_pct = log.soc_pct
+    contradicts = abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0
+    if soc_pct is not None and not finding.sign and contradicts:
+        first, last = soc_pct[np.isfinite(soc_pct)][[0, -1]]
+        why = f"by the sign of current that the voltage proves ({voltage.strongest.text})"
+        moves = f"it moves from {first:.4g} to {last:.4g} % against the charge, {why}"
+        remarks.append(f"SoC left out: {moves}; is it a depth of discharge?")
+        soc_pct, finding = None, voltage
+    if is_open and assumed:
+        way = "charges" if finding.sign < 0 else "discharges"
+        how = "found from the data" if finding.sign else "not confirmed by the data"
+        assumed.append(f"positive current {way}, {how}")
+    if is_open and finding.sign < 0:
+        current_a = 0.0 - current_a
+        remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
+    elif finding.sign < 0:
+        kept = "current looks inverted and was kept as stored"
+        if sign_by == "user":
+            kept = "the stated sign of current looks inverted and was kept as stated"
+        remarks.append(f"{kept}: {finding.sentence}")
+    elif is_open and not finding.sign:
+        remark = "sign of current unknown and undetermined by the data: kept as stored"
+        remarks.append(f"{remark} (--sign charge inverts it)")
+    return replace(
+        log,
+        current_a=current_a,
+        soc_pct=soc_pct,
+        remarks=tuple(remarks),
+        assumed=tuple(assumed),
+    )
+
+
+# --- Size
+
+
+def _in_canonical_units(
+    log: Log, labels: Mapping[str, str], in_seconds: bool | None, stated: Collection[str]
+) -> Log:
+    """Return the log, with a remark on an unusual temperature; InputError for another unit."""
+    table = (
+        ("time_s", _of_time(log, in_seconds)),
+        # Before the voltage: a temperature in its place looks like kilovolts.
+        ("temperature_c", _swapped(log, labels.get("voltage_v", "voltage_v"))),
+        ("voltage_v", _of_voltage(log.voltage_v)),
+        ("current_a", _of_current(log)),
+        ("soc_pct", _of_soc(log.soc_pct, is_stated="soc_pct" in stated)),
+        ("temperature_c", _of_temperature(log.temperature_c, may_be_swapped=_is_cool(log))),
+    )
+    wrong: dict[str, _Hypothesis] = {}
+    for field, hypotheses in table:
+        for each in hypotheses:
+            if each[0]:
+                wrong.setdefault(field, each)
+    named = {
+        field: (labels[field], units)
+        for field, (*_, units) in wrong.items()
+        if units and field not in stated and labels.get(field, field).lower() != field
+    }
+    for field, (_, value, problem, cure, _) in wrong.items():  # the first is raised
+        sure = {each: column for each, column in named.items() if len(column[1]) == 1}
+        options = sure if field in sure else {field: named[field]} if field in named else {}
+        if len(options) > 1:
+            cure = f"state the units: {_option(options)}"  # noqa: PLW2901
+        elif options:
+            cure = f"{cure} (or state the unit: {_option(options)})"  # noqa: PLW2901
+        where, label = log.source or log.name, labels.get(field, field)
+        raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
+    typical_c = float(np.median(log.temperature_c))
+    if typical_c <= LIMITS["unusually_hot_c"]:
+        return log
+    option = _option({"temperature_c": (labels.get("temperature_c", "temperature_c"), ["°F"])})
+    doubt = "" if "temperature_c" in stated else f": if it is °F, state the unit: {option}"
+    remark = f"temperature {typical_c:.0f} °C is unusually hot{doubt}"
+    return replace(log, remarks=(*log.remarks, remark))
+
+
+def _option(columns: Mapping[str, tuple[str, Sequence[str]]]) -> str:
+    """Return the option that states the units of columns, "?" where one may have several."""
+    texts, how = [], ""
+    for field, (label, units) in columns.items():
+        unit, is_tick = units[0], "tick" in label.lower()
+        if len(units) > 1 or is_tick:
+            unit, how = "?", f", with {' or '.join(units)} for ?"
+        if is_tick:
+            how += " and a factor, such as [ms]:10 for ticks of 10 ms"
+        texts.append(f"{field.rpartition('_')[0]}={label}[{unit}]")
+    return f"--columns '{','.join(texts)}'{how}"
+
+
+# Hypotheses on a column, the likeliest first. Medians stand before single values, so that a few odd
+# rows are not another unit.
+
+
+def _of_time(log: Log, in_seconds: bool | None) -> list[_Hypothesis]:
+    first, step = float(log.time_s[0]), np.diff(log.time_s)
+    usual = float(np.median(step)) if step.size else 1.0
+    finer = _fitting(usual, ("ms", "us", "ns"))
+    coarser = ["d"] if first > LIMITS["spreadsheet_d"] else _fitting(usual, ("min", "h", "d"))
+    looks_finer, looks_coarser = (
+        f"rows are {usual:g} apart: time looks like"
+        f" {' or '.join(_TIME_UNITS[unit] for unit in units) or 'another unit'}"
+        for units in (finer, coarser)
+    )
+    others = _other_units(log, finer, coarser) if in_seconds is None and step.size else []
+    convert = "convert it to seconds"
+    too_slow = "a log with a row every 90 s or more cannot be used"
+    is_slow, is_fast = usual > LIMITS["interval_s"], usual < 1.0 / LIMITS["rate_hz"]
+    longest = int(np.argmax(step)) + 1 if step.size else 0
+    days = log.duration_s / _seconds("d")
+    return [
+        (
+            first > LIMITS["stamp_s"],
+            first,
+            "time looks like milliseconds since 1970",
+            "divide it by 1000",
+            ["ms"],
+        ),
+        (
+            is_slow and in_seconds,
+            usual,
+            f"rows are {usual:g} s apart: {too_slow}",
+            "export a row each minute",
+            [],
+        ),
+        (is_slow, usual, looks_finer, f"{convert} ({too_slow})", finer),
+        (is_fast and not in_seconds, usual, looks_coarser, convert, coarser),
+        (
+            others != [],
+            usual,
+            f"rows are {usual:g} apart, in seconds or another unit",
+            "name the unit in the heading",
+            ["s", *others],
+        ),
+        _odd_row(log.time_s, np.abs(log.time_s) > LIMITS["stamp_s"], "a time in seconds"),
+        (
+            days > LIMITS["log_d"],
+            float(log.time_s[longest]),
+            f"the log lasts {days:.0f} days; its longest step ends at row {longest + 1}",
+            "if the clock was set there, split the log there",
+            [],
+        ),
+    ]
+
+
+def _seconds(unit: str) -> float:
+    return QUANTITIES["time"].units[unit][0]
+
+
+def _fitting(step: float, units: Sequence[str]) -> list[str]:
+    """Return those of the units in which rows are as far apart as a log's."""
+    least_s, most_s = LIMITS["fastest_s"], LIMITS["interval_s"]
+    return [unit for unit in units if least_s <= step * _seconds(unit) <= most_s]
+
+
+def _other_units(log: Log, finer: list[str], coarser: list[str]) -> list[str]:
+    """Return those of the units that time may be in as well as in seconds."""
+    step = np.diff(log.time_s)
+    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
+    if finer and np.all(log.time_s % 1.0 == 0.0) and np.min(step) >= 10.0:
+        with suppress(InputError):  # in the finer unit, a SoC may need a current of many C
+            capacity_ah = abs(implied_capacity([log], least_pct=0.0).capacity_ah)
+            rms_a = float(np.sqrt(np.mean(log.current_a**2)))
+            if rms_a > LIMITS["c_rate_per_h"] * capacity_ah * _seconds(finer[0]):
+                return []
+        return finer
+    mean = float(step.mean())
+    parts = [1000.0 * mean, *(mean * _seconds(unit) for unit in coarser)]
+    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
+    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
+    return coarser if is_coarse else []
+
+
+def _swapped(log: Log, voltage_label: str) -> Iterator[_Hypothesis]:
+    usual_c = float(np.median(log.temperature_c))
+    is_volts = 273.15 + LIMITS["unusually_hot_c"] < usual_c <= LIMITS["voltage_v"]
+    is_code = np.ptp(log.temperature_c) == 0.0
+    problem = f"it looks like a pack's voltage, and {voltage_label} like a temperature"
+    cure = "the two columns (or signals) look swapped: exchange them"
+    yield _is_cool(log) and is_volts and not is_code, usual_c, problem, cure, []
+
+
+def _is_cool(log: Log) -> bool:
+    """Return whether the voltage could be a temperature."""
+    return bool(COLDEST_C <= np.median(log.voltage_v) <= LIMITS["unusually_hot_c"])
+
+
+def _of_temperature(celsius: FloatArray, *, may_be_swapped: bool) -> list[_Hypothesis]:
+    usual, kind = float(np.median(celsius)), "a battery's temperature in °C"
+    also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
+    kelvin = ["K"] if np.any(celsius % 1.0) else ["K", "0.1°C"]
+    is_odd = (celsius < COLDEST_C) | (celsius > HOTTEST_C)
+    return [
+        (
+            200.0 <= usual <= 400.0,
+            usual,
+            "temperature looks like kelvin",
+            f"subtract 273.15{also}",
+            kelvin,
+        ),
+        (
+            10.0 * HOTTEST_C < usual <= 1000.0 * HOTTEST_C,
+            usual,
+            "temperature looks like thousandths of a degree",
+            "divide it by 1000",
+            ["0.001°C"],
+        ),
+        (not COLDEST_C <= usual <= HOTTEST_C, usual, f"this is not {kind}", "convert it to °C", []),
+        _odd_row(celsius, is_odd, kind),
+    ]
+
+
+def _of_voltage(volts: FloatArray) -> list[_Hypothesis]:
+    usual = float(np.median(volts))
+    return [
+        _in_finer_unit(usual, LIMITS["voltage_v"], "volts", "voltage"),
+        (
+            usual <= 0.0,
+            usual,
+            "the median voltage is not positive",
+            "check column and polarity",
+            [],
+        ),
+        (usual < 1.0, usual, "voltage looks like kilovolts", "convert it to volts", ["kV"]),
+        _odd_row(volts, np.abs(volts) > LIMITS["voltage_v"], "a battery's voltage"),
+    ]
+
+
+def _of_current(log: Log) -> list[_Hypothesis]:
+    amps, most = np.abs(log.current_a), LIMITS["current_a"]
+    peak, is_odd = int(np.argmax(amps)), amps > most
+    odd = _odd_row(log.current_a, is_odd, "a battery's current")
+    are_few = amps.size > 1000 and np.mean(is_odd) < LIMITS["odd_share"]
+    if are_few or all(map(_is_code, set(amps[is_odd]))):
+        return [*_wrapped(log), odd]
+    value, what = float(log.current_a[peak]), f"current exceeds {most:g} A in row {peak + 1}: it"
+    return [*_wrapped(log), _in_finer_unit(value, most, "amperes", what)]
+
+
+def _wrapped(log: Log) -> Iterator[_Hypothesis]:
+    found = wrapped_current(log.current_a, log.voltage_v)
+    if found is not None:
+        wraps_at_a, bits, step_a = found
+        field = f"{bits} bits unsigned of {step_a:g} A"
+        problem = f"the current wraps at {wraps_at_a:.10g} A ({field}): {WRAPPED}"
+        cure = f"read it as signed: {wraps_at_a:.10g} A less, from half of that on"
+        yield True, log.current_a[np.argmax(np.abs(log.current_a))], problem, cure, []
+
+
+def _is_code(value: float) -> bool:
+    """Return whether all bits of its digits are set (65535), or but the last or the highest."""
+    number = int(f"{value:f}".replace(".", "").strip("0"))
+    return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
+
+
+def _of_soc(soc_pct: FloatArray | None, *, is_stated: bool) -> list[_Hypothesis]:
+    if soc_pct is None or not np.isfinite(soc_pct).any():
+        return []
+    least, most = float(np.nanmin(soc_pct)), float(np.nanmax(soc_pct))
+    is_share = least >= 0.0 and 0.0 < most <= 1.0 and not is_stated
+    odd = most if most > 110.0 else least
+    row = int(np.argmax(soc_pct == odd)) + 1
+    return [
+        (
+            is_share,
+            most,
+            "SoC looks like a fraction of 1",
+            "multiply it by 100 (or leave it out if it stays below 1 %)",
+            ["-", "%"],
+        ),
+        (
+            not -10.0 <= odd <= 110.0,
+            odd,
+            f"SoC of row {row} is not within 0–100 %",
+            "convert it to %",
+            [],
+        ),
+    ]
+
+
+def _odd_row(values: FloatArray, is_odd: BoolArray, kind: str) -> _Hypothesis:
+    """Return that a single row, the first, is impossible."""
+    row = int(np.argmax(is_odd))
+    cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
+    return is_odd[row], float(values[row]), f"row {row + 1} is not {kind}", cure, []
+
+
+def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Hypothesis:
+    """Return that a value above a limit [V or A] is in milli or micro."""
+    prefix, divisor, symbol = "milli", "1000", "m"
+    if abs(value) > 1e3 * limit:
+        prefix, divisor, symbol = "micro", "1,000,000", "u"
+    problem, cure = f"{what} looks like {prefix}{unit}", f"divide it by {divisor}"
+    return abs(value) > limit, value, problem, cure, [f"{symbol}{unit[0].upper()}"]
