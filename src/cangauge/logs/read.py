@@ -27,7 +27,7 @@ from cangauge.logs.quantities import FIELDS
 from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
-from cangauge.logs.values import is_number, numbers_of, with_decimal_points
+from cangauge.logs.values import is_number, numbers_of
 from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
@@ -180,7 +180,7 @@ class LogFile:
         cells = _cells(table.headings, source)
         if len(cells) < 2:  # a single cell is its pack
             return None
-        columns = with_decimal_points(table.columns([place for place, _ in cells.values()]))
+        columns = table.columns([place for place, _ in cells.values()])
         each_v = [
             scale * numbers_of(columns[place], source, table.headings[place])[0]
             for place, scale in cells.values()

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.quantities import EPOCHS, LIMITS, unit_of
-from cangauge.logs.values import first_text, is_number, is_text, numbers_of, present, unit_in_cell
+from cangauge.logs.values import first_text, is_number, numbers_of, unit_in_cell
 
 _CLOCK: Final = (
     r"(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
@@ -128,11 +128,9 @@ def seconds_of(
         return seconds_of_text(joined, order_or_zone, source, label)
     if pa.types.is_date(kind):
         column = column.cast(pa.string())
-    cells = present(column) if is_text(column) else None
-    first = "0" if cells is None else first_text(cells)
-    has_unit = unit_of("time_s", unit_in_cell(first)) is not None
-    if cells is not None and not is_number(first or "0") and not has_unit:
-        return seconds_of_text(cells, order_or_zone, source, label)
+    first = first_text(column)
+    if first and not is_number(first) and unit_of("time_s", unit_in_cell(first)) is None:
+        return seconds_of_text(column.cast(pa.string()), order_or_zone, source, label)
     values, in_cells = numbers_of(column, source, label)
     digits = _spelled_in_digits(values) if not unit or is_format else None
     if digits is not None:

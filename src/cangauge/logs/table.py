@@ -42,7 +42,7 @@ from cangauge.logs.quantities import (
 )
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
-from cangauge.logs.values import first_text, is_number, numbers_of, present, with_decimal_points
+from cangauge.logs.values import first_text, is_number, numbers_of, read_cells
 
 MAX_COUNTERS: Final = 6
 """Most columns in Ah of which one is looked for that counts the charge [-]."""
@@ -80,7 +80,8 @@ class ArrowTable:
         for name in names:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
-        return {place: table.column(name) for place, name in zip(places, names, strict=True)}
+        columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
+        return read_cells(columns, self.headings)
 
 
 def draft_of_table(
@@ -105,7 +106,7 @@ def draft_of_table(
     wanted += [place for place, _ in chosen["time"].others] + words
     counters = _counters(table, wanted) if "soc" in chosen and not choice.is_canonical else {}
     wanted += counters
-    cells = with_decimal_points(table.columns([*dict.fromkeys(wanted)]))
+    cells = table.columns([*dict.fromkeys(wanted)])
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
     draft.values["time_s"] = time_s
@@ -222,7 +223,7 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         if headings.count(text) == 1 and _STATES.search(text.lower())
     ]
     for place, column in table.columns(places).items() if places else ():
-        cells = pc.fill_null(pc.utf8_lower(present(column)), "")
+        cells = pc.fill_null(pc.utf8_lower(column.cast(pa.string())), "")
         charges, discharges = (
             np.asarray(pc.match_substring_regex(cells, words), dtype=bool) & (current > 0.0)
             for words in (_CHARGES, _DISCHARGES)

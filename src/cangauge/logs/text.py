@@ -7,13 +7,12 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, product
+from itertools import chain, product, repeat
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
@@ -23,13 +22,11 @@ from cangauge.logs.columns import Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps, is_stamp
-from cangauge.logs.values import MISSING, is_bare, is_number, is_spelled, is_text, unit_in_cell
+from cangauge.logs.values import is_number, read_cells, unit_in_cell
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
-_NULLS: Final = [spell(text) for text in MISSING for spell in (str.lower, str.upper, str.title)]
-_NULLS.append("NaN")
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _ROWS_ABOVE_DATA: Final = 4
 """Rows of units, types and remarks between a header and its data."""
@@ -47,83 +44,47 @@ class TextTable(NamedTuple):
     remarks: list[str]
 
     def columns(self, places: Sequence[int]) -> dict[int, Any]:
-        """Read columns as numbers, or as text where their cells are spelled otherwise.
+        """Read columns, as `read_cells`.
 
-        Null stands where there is no value. A cut last line and closing remarks of the exporter
-        are left out, with a remark.
+        A cut last line and closing remarks of the exporter are left out, with a remark.
 
         Raises
         ------
         InputError
             If there is no row, or a row in the middle has the wrong number of cells.
         """
-        data = as_utf8(self.head.read())
-        width = self._width(places)
-        # A cell that is no bare number: all columns are read again as they are spelled.
-        for kinds in (self._kinds(places), dict.fromkeys(places, pa.string())):
-            try:
-                table, odd_rows = self._read(data, width, kinds)
-                break
-            except pa.ArrowInvalid as error:
-                reason = str(error).splitlines()[0]
-        else:
-            raise self._error(f"the table cannot be read: {reason}", "export it again")
-        self._remark_odd(odd_rows, table.num_rows)
-        if table.num_rows > MAX_ROWS:
-            raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
-        if not table.num_rows:
-            raise self._error("there are no rows below the header", "check the export")
-        if not data.endswith((b"\n", b"\r")):
-            doubt = "if the file was cut off, its last value may be short"
-            self.remarks.append(f"the last line has no line end: {doubt}")
-        return {place: self._values(table.column(f"c{place}"), place) for place in kinds}
-
-    def _kinds(self, places: Sequence[int]) -> dict[int, Any]:
-        """Return the type by which each column is read: numbers, unless a first cell is spelled.
-
-        Decimal commas, thousands and units concern the numbers of the whole table, which is then
-        text.
-        """
-        rows = [split_cells(line, self.delimiter) for line in self.head.lines[self.skip_lines :]]
-        first = {place: _first_value(rows, place) for place in places}
-        if any(map(is_spelled, first.values())):
-            return dict.fromkeys(first, pa.string())
-        return {
-            place: pa.float64() if is_bare(cell) or not cell else pa.string()
-            for place, cell in first.items()
-        }
-
-    def _read(self, data: bytes, width: int, kinds: Mapping[int, Any]) -> tuple[Any, list[Any]]:
-        """Return columns by their types, and the rows of another width."""
-        odd_rows = list[Any]()
+        width, odd_rows = self._width(places), list[Any]()
 
         def skip(row: Any) -> str:
             odd_rows.append(row)
             return "skip"
 
-        types = {f"c{place}": kind for place, kind in kinds.items()}
+        names = [f"c{place}" for place in range(width)]
+        types = {names[place]: pa.string() for place in places}
         # One thread: otherwise pyarrow does not number odd rows.
-        how = pacsv.ReadOptions(
-            use_threads=False,
-            column_names=[f"c{place}" for place in range(width)],
-            skip_rows=self.skip_lines,
+        options = (
+            pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines),
+            pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip),
+            pacsv.ConvertOptions(
+                include_columns=[*types], column_types=types, strings_can_be_null=True
+            ),
         )
-        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
-        cells = pacsv.ConvertOptions(
-            include_columns=[*types],
-            column_types=types,
-            null_values=_NULLS,
-            strings_can_be_null=True,
-        )
-        return pacsv.read_csv(pa.BufferReader(data), how, rows, cells), odd_rows
-
-    def _values(self, cells: Any, place: int) -> Any:
-        """Return cells, null where a restarted logger wrote its header again."""
-        heading = self.headings[place] if place < len(self.headings) else ""
-        if not is_text(cells):
-            return cells
-        is_heading = pc.equal(pc.utf8_trim_whitespace(cells), heading)
-        return pc.if_else(is_heading, None, cells) if pc.any(is_heading).as_py() else cells
+        data = as_utf8(self.head.read())
+        is_whole = data.endswith((b"\n", b"\r"))
+        try:
+            table = pacsv.read_csv(pa.BufferReader(data), *options)
+        except pa.ArrowInvalid as error:
+            reason = str(error).splitlines()[0]
+            raise self._error(f"the table cannot be read: {reason}", "export it again") from error
+        del data  # before the numbers take their memory
+        self._remark_odd(odd_rows, table.num_rows)
+        if table.num_rows > MAX_ROWS:
+            raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
+        if not is_whole:
+            doubt = "if the file was cut off, its last value may be short"
+            self.remarks.append(f"the last line has no line end: {doubt}")
+        headings = [*self.headings, *repeat("", width)]
+        return read_cells({place: table.column(names[place]) for place in places}, headings)
 
     def _width(self, places: Sequence[int]) -> int:
         """Return the number of cells of the first row, which may be another than the header's."""
@@ -161,11 +122,6 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     """Split a line into cells, without enclosing blanks and quotes."""
     reader = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
     return [cell.strip() for cell in next(reader, [])]
-
-
-def _first_value(rows: Sequence[Sequence[str]], place: int) -> str:
-    cells = (row[place] for row in rows if place < len(row))
-    return next((cell for cell in cells if cell.lower() not in MISSING), "")
 
 
 def _is_value(cell: str) -> bool:

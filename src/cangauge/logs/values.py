@@ -1,9 +1,9 @@
-"""Cells of a table's column: which of them hold no value, and the numbers in the others."""
+"""Cells of a table: which of them hold no value, and the numbers in the others."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,11 +13,9 @@ import pyarrow.compute as pc
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 
-_WORDS: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
-MISSING: Final = ("", *_WORDS.split())
+_MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
 """Cells without a value, in lower case."""
 _WITH_UNIT: Final = r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
-_BARE: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _NUMBER: Final = r"^[-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?\s*\D{0,4}$"
 _SPELLINGS: Final = (("[\u2212\u2013]", "-"), ("['\u2019\u00a0\u202f](\\d{3})", r"\1"))
 """A typographic minus; 1'800."""
@@ -37,84 +35,72 @@ def is_number(text: str) -> bool:
     return True
 
 
-def is_bare(text: str) -> bool:
-    """Return whether a cell is a number as programs write it."""
-    return _BARE.fullmatch(text) is not None
-
-
-def is_spelled(text: str) -> bool:
-    """Return whether a cell is a number of another spelling: `1.800,5`, `53.2 V`, `−7`."""
-    for pattern, replacement in _SPELLINGS:
-        text = re.sub(pattern, replacement, text)
-    return re.match(_NUMBER, text) is not None and not is_bare(text)
-
-
 def is_text(column: Any) -> bool:
     """Return whether an Arrow column holds text, dictionary-encoded or not."""
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
     return str(kind) in {"string", "large_string", "string_view"}
 
 
-def present(column: Any) -> Any:
-    """Return the trimmed cells of a column of text, null where there is no value."""
-    trimmed = pc.utf8_trim_whitespace(column.cast(pa.string()))
-    is_missing = pc.is_in(pc.utf8_lower(trimmed), value_set=pa.array(MISSING))
+def first_text(column: Any) -> str:
+    """Return the first value of a column of text; "" of any other."""
+    known = column.drop_null() if is_text(column) else ()
+    return str(known[0].as_py()) if len(known) else ""
+
+
+def read_cells(columns: Mapping[int, Any], headings: Sequence[str]) -> dict[int, Any]:
+    """Return columns of one table: text that holds numbers as these, other text trimmed.
+
+    Null stands where there is no value, and where a restarted logger wrote its header again. If all
+    numbers are written as programs do, that is all. If not, the columns of numbers are read again
+    as they are spelled (`−1'800,5 V`): what a mark means in one column tells it in another.
+    """
+    texts = {place: each.cast(pa.string()) for place, each in columns.items() if is_text(each)}
+    read = {**columns}
+    for place, cells in texts.items():
+        read[place] = _as_numbers(cells)
+        if is_text(read[place]):
+            texts[place] = _present(cells, headings[place])
+            read[place] = _as_numbers(texts[place])
+    if any(is_text(read[place]) and _begins_with_number(cells) for place, cells in texts.items()):
+        spelled = {place: cells for place, cells in texts.items() if _begins_with_number(cells)}
+        for place, cells in _with_decimal_points(spelled).items():
+            read[place] = _as_numbers(cells)
+    return read
+
+
+def _as_numbers(cells: Any) -> Any:
+    """Return cells of text as numbers, or as they are if one is none."""
+    try:
+        return pc.cast(cells, pa.float64())
+    except pa.ArrowInvalid:
+        return cells
+
+
+def _present(cells: Any, heading: str) -> Any:
+    """Return trimmed cells, null where there is no value but perhaps the heading."""
+    trimmed = pc.utf8_trim_whitespace(cells)
+    missing = pa.array(["", heading.lower(), *_MISSING.split()])
+    is_missing = pc.is_in(pc.utf8_lower(trimmed), value_set=missing)
     return pc.if_else(is_missing, pa.scalar(None, pa.string()), trimmed)
 
 
-def first_text(column: Any) -> str:
-    """Return the first value of a column of text; "" of any other."""
-    cells = column if is_text(column) else ()
-    return next((str(cell.as_py()) for cell in cells if cell.is_valid), "")
+def _begins_with_number(cells: Any) -> bool:
+    first = first_text(cells)
+    for pattern, alike in _SPELLINGS:
+        first = re.sub(pattern, alike, first)
+    return re.match(_NUMBER, first) is not None and not _DATE.fullmatch(first)
 
 
-def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
-    """Return a column as numbers, NaN where missing, and the unit in its cells (`53.2 V`).
-
-    Raises
-    ------
-    InputError
-        If a cell holds anything but a number, or the column has another type.
-    """
-    of, kind = pa.types, column.type
-    is_numeric = of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
-    if not (is_numeric or is_text(column) or of.is_null(kind)):
-        problem, cure = "the column does not hold numbers", "store it as floating point"
-        raise InputError(problem, source=source, field=label, value=str(kind)[:60], cure=cure)
-    unit = ""
-    try:
-        try:
-            numbers = pc.cast(column, pa.float64(), safe=False)
-        except pa.ArrowInvalid:
-            bare, unit = _without_unit(present(with_decimal_points({0: column})[0]))
-            numbers = pc.cast(bare, pa.float64())
-    except pa.ArrowInvalid as error:
-        texts = enumerate(present(column).to_pylist(), start=1)
-        wrong = ((k, text) for k, text in texts if text and not is_number(text))
-        row, value = next(wrong, (1, None))
-        cure = "correct the cell, or leave it empty where the value is unknown"
-        problem = f"row {row} is not a number"
-        raise InputError(problem, source=source, field=label, value=value, cure=cure) from error
-    return np.array(numbers.to_numpy(), dtype=np.float64), unit
-
-
-def with_decimal_points(columns: Mapping[int, Any]) -> dict[int, Any]:
-    """Return the columns of one table with `-` as minus and `.` as the only mark in numbers.
+def _with_decimal_points(columns: Mapping[int, Any]) -> dict[int, Any]:
+    """Return columns of numbers with `-` as minus and `.` as the only mark.
 
     A mark separates thousands in a column where each of its uses fits that (`1,800`), if the other
     mark is decimal: it follows in the same cell, or the table's numbers use it and not this one.
     """
-    texts: dict[int, Any] = {}
-    for place, column in columns.items():
-        if is_text(column):
-            cells = column.cast(pa.string())
-            for pattern, replacement in _SPELLINGS:
-                cells = pc.replace_substring_regex(cells, pattern, replacement)
-            first = first_text(present(cells))
-            if re.match(_NUMBER, first) and not _DATE.fullmatch(first):
-                texts[place] = cells
-    if not any(_any(cells, ",") for cells in texts.values()):
-        return {**columns, **texts}
+    texts = {**columns}
+    for pattern, alike in _SPELLINGS:
+        for place, cells in texts.items():
+            texts[place] = pc.replace_substring_regex(cells, pattern, alike)
     one_mark = r"^[^.,]*[{}][^.,]*$"
     used = {mark for mark in _MARKS for cells in texts.values() if _odd(cells, one_mark, mark)}
     for place, cells in texts.items():
@@ -124,7 +110,7 @@ def with_decimal_points(columns: Mapping[int, Any]) -> dict[int, Any]:
                 texts[place] = pc.replace_substring(cells, other, "")
                 break
         texts[place] = pc.replace_substring(texts[place], ",", ".")
-    return {**columns, **texts}
+    return texts
 
 
 def _any(cells: Any, pattern: str) -> bool:
@@ -136,6 +122,33 @@ def _odd(cells: Any, pattern: str, mark: str) -> bool:
     has_mark = pc.match_substring_regex(cells, pattern.format(mark))
     fits = pc.match_substring_regex(cells, _THOUSANDS.format(mark))
     return bool(pc.any(pc.and_not(has_mark, fits)).as_py())
+
+
+def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
+    """Return a column as numbers, NaN where missing, and the unit in its cells (`53.2 V`).
+
+    Raises
+    ------
+    InputError
+        If a cell holds anything but a number, or the column has another type.
+    """
+    cells, unit = _without_unit(column) if is_text(column) else (column, "")
+    of, kind = pa.types, cells.type
+    is_numeric = of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
+    if not (is_numeric or is_text(cells) or of.is_null(kind)):
+        problem, cure = "the column does not hold numbers", "store it as floating point"
+        raise InputError(problem, source=source, field=label, value=str(kind)[:60], cure=cure)
+    try:
+        numbers = pc.cast(cells, pa.float64(), safe=False)
+    except pa.ArrowInvalid as error:
+        texts = enumerate(column.to_pylist(), start=1)
+        row, value = next(
+            ((k, text) for k, text in texts if text and not is_number(text)), (1, None)
+        )
+        cure = "correct the cell, or leave it empty where the value is unknown"
+        problem = f"row {row} is not a number"
+        raise InputError(problem, source=source, field=label, value=value, cure=cure) from error
+    return np.require(numbers.to_numpy(), np.float64, "W"), unit
 
 
 def unit_in_cell(text: str) -> str:
