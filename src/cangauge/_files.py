@@ -7,6 +7,7 @@ one clear error; nothing is lost when writing fails.
 from __future__ import annotations
 
 import bz2
+import codecs
 import errno
 import glob
 import gzip
@@ -156,10 +157,10 @@ def as_utf8(data: bytes) -> bytes:
         zeros = halves.count(0)
         if 2 * zeros > len(halves) and data[:HEAD_BYTES].count(0) == zeros:
             return data.decode(codec, errors="replace").encode()
-    if data.isascii():
-        return data
-    try:
-        data.decode("utf-8")
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:  # in pieces, as the text of a large file takes memory
+        for place in range(0, len(data), MIB):
+            decoder.decode(data[place : place + MIB], final=place + MIB >= len(data))
     except UnicodeDecodeError:
         head = data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1]
         codec = "gb18030" if _CHINESE.fullmatch(head) else "latin-1"

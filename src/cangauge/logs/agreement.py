@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._typing import BoolArray, FloatArray
+from cangauge._typing import FloatArray
 from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
 from cangauge.logs.charge import implied_capacity, with_own_count
 from cangauge.logs.log import Log
@@ -128,14 +128,20 @@ def _in_canonical_units(
     log: Log, labels: Mapping[str, str], in_seconds: bool | None, stated: Collection[str]
 ) -> Log:
     """Return the log, with a remark on an unusual temperature; InputError for another unit."""
+    usual_v, usual_c = float(np.median(log.voltage_v)), float(np.median(log.temperature_c))
+    may_be_swapped = COLDEST_C <= usual_v <= LIMITS["unusually_hot_c"]
+    label_v, label_c = (labels.get(name, name) for name in ("voltage_v", "temperature_c"))
     table = (
         ("time_s", _of_time(log, in_seconds)),
         # Before the voltage: a temperature in its place looks like kilovolts.
-        ("temperature_c", _swapped(log, labels.get("voltage_v", "voltage_v"))),
-        ("voltage_v", _of_voltage(log.voltage_v)),
+        ("temperature_c", _swapped(log, usual_c, label_v) if may_be_swapped else ()),
+        ("voltage_v", _of_voltage(log.voltage_v, usual_v)),
         ("current_a", _of_current(log)),
         ("soc_pct", _of_soc(log.soc_pct, is_stated="soc_pct" in stated)),
-        ("temperature_c", _of_temperature(log.temperature_c, may_be_swapped=_is_cool(log))),
+        (
+            "temperature_c",
+            _of_temperature(log.temperature_c, usual_c, may_be_swapped=may_be_swapped),
+        ),
     )
     wrong: dict[str, _Hypothesis] = {}
     for field, hypotheses in table:
@@ -156,12 +162,11 @@ def _in_canonical_units(
             cure = f"{cure} (or state the unit: {_option(options)})"  # noqa: PLW2901
         where, label = log.source or log.name, labels.get(field, field)
         raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
-    typical_c = float(np.median(log.temperature_c))
-    if typical_c <= LIMITS["unusually_hot_c"]:
+    if usual_c <= LIMITS["unusually_hot_c"]:
         return log
-    option = _option({"temperature_c": (labels.get("temperature_c", "temperature_c"), ["°F"])})
-    doubt = "" if "temperature_c" in stated else f": if it is °F, state the unit: {option}"
-    remark = f"temperature {typical_c:.0f} °C is unusually hot{doubt}"
+    doubt = f": if it is °F, state the unit: {_option({'temperature_c': (label_c, ['°F'])})}"
+    remark = f"temperature {usual_c:.0f} °C is unusually hot"
+    remark += "" if "temperature_c" in stated else doubt
     return replace(log, remarks=(*log.remarks, remark))
 
 
@@ -222,7 +227,7 @@ def _of_time(log: Log, in_seconds: bool | None) -> list[_Hypothesis]:
             "name the unit in the heading",
             ["s", *others],
         ),
-        _odd_row(log.time_s, np.abs(log.time_s) > LIMITS["stamp_s"], "a time in seconds"),
+        _odd_row(log.time_s, -LIMITS["stamp_s"], LIMITS["stamp_s"], "a time in seconds"),
         (
             days > LIMITS["log_d"],
             float(log.time_s[longest]),
@@ -261,32 +266,27 @@ def _other_units(log: Log, finer: list[str], coarser: list[str]) -> list[str]:
     return coarser if is_coarse else []
 
 
-def _swapped(log: Log, voltage_label: str) -> Iterator[_Hypothesis]:
-    usual_c = float(np.median(log.temperature_c))
+def _swapped(log: Log, usual_c: float, voltage_label: str) -> Iterator[_Hypothesis]:
     is_volts = 273.15 + LIMITS["unusually_hot_c"] < usual_c <= LIMITS["voltage_v"]
     is_code = np.ptp(log.temperature_c) == 0.0
     problem = f"it looks like a pack's voltage, and {voltage_label} like a temperature"
     cure = "the two columns (or signals) look swapped: exchange them"
-    yield _is_cool(log) and is_volts and not is_code, usual_c, problem, cure, []
+    yield is_volts and not is_code, usual_c, problem, cure, []
 
 
-def _is_cool(log: Log) -> bool:
-    """Return whether the voltage could be a temperature."""
-    return bool(COLDEST_C <= np.median(log.voltage_v) <= LIMITS["unusually_hot_c"])
-
-
-def _of_temperature(celsius: FloatArray, *, may_be_swapped: bool) -> list[_Hypothesis]:
-    usual, kind = float(np.median(celsius)), "a battery's temperature in °C"
+def _of_temperature(
+    celsius: FloatArray, usual: float, *, may_be_swapped: bool
+) -> list[_Hypothesis]:
+    kind = "a battery's temperature in °C"
     also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
-    kelvin = ["K"] if np.any(celsius % 1.0) else ["K", "0.1°C"]
-    is_odd = (celsius < COLDEST_C) | (celsius > HOTTEST_C)
+    is_kelvin = 200.0 <= usual <= 400.0
     return [
         (
-            200.0 <= usual <= 400.0,
+            is_kelvin,
             usual,
             "temperature looks like kelvin",
             f"subtract 273.15{also}",
-            kelvin,
+            ["K"] if is_kelvin and np.any(celsius % 1.0) else ["K", "0.1°C"],
         ),
         (
             10.0 * HOTTEST_C < usual <= 1000.0 * HOTTEST_C,
@@ -296,12 +296,11 @@ def _of_temperature(celsius: FloatArray, *, may_be_swapped: bool) -> list[_Hypot
             ["0.001°C"],
         ),
         (not COLDEST_C <= usual <= HOTTEST_C, usual, f"this is not {kind}", "convert it to °C", []),
-        _odd_row(celsius, is_odd, kind),
+        _odd_row(celsius, COLDEST_C, HOTTEST_C, kind),
     ]
 
 
-def _of_voltage(volts: FloatArray) -> list[_Hypothesis]:
-    usual = float(np.median(volts))
+def _of_voltage(volts: FloatArray, usual: float) -> list[_Hypothesis]:
     return [
         _in_finer_unit(usual, LIMITS["voltage_v"], "volts", "voltage"),
         (
@@ -312,19 +311,21 @@ def _of_voltage(volts: FloatArray) -> list[_Hypothesis]:
             [],
         ),
         (usual < 1.0, usual, "voltage looks like kilovolts", "convert it to volts", ["kV"]),
-        _odd_row(volts, np.abs(volts) > LIMITS["voltage_v"], "a battery's voltage"),
+        _odd_row(volts, -LIMITS["voltage_v"], LIMITS["voltage_v"], "a battery's voltage"),
     ]
 
 
 def _of_current(log: Log) -> list[_Hypothesis]:
-    amps, most = np.abs(log.current_a), LIMITS["current_a"]
-    peak, is_odd = int(np.argmax(amps)), amps > most
-    odd = _odd_row(log.current_a, is_odd, "a battery's current")
-    are_few = amps.size > 1000 and np.mean(is_odd) < LIMITS["odd_share"]
-    if are_few or all(map(_is_code, set(amps[is_odd]))):
-        return [*_wrapped(log), odd]
-    value, what = float(log.current_a[peak]), f"current exceeds {most:g} A in row {peak + 1}: it"
-    return [*_wrapped(log), _in_finer_unit(value, most, "amperes", what)]
+    amps, most = log.current_a, LIMITS["current_a"]
+    odd = _odd_row(amps, -most, most, "a battery's current")
+    if odd[0]:
+        large = np.abs(amps) > most
+        are_few = amps.size > 1000 and np.mean(large) < LIMITS["odd_share"]
+        if not are_few and not all(map(_is_code, set(np.abs(amps[large])))):
+            peak = int(np.argmax(np.abs(amps)))
+            what = f"current exceeds {most:g} A in row {peak + 1}: it"
+            odd = _in_finer_unit(float(amps[peak]), most, "amperes", what)
+    return [*_wrapped(log), odd]
 
 
 def _wrapped(log: Log) -> Iterator[_Hypothesis]:
@@ -368,11 +369,12 @@ def _of_soc(soc_pct: FloatArray | None, *, is_stated: bool) -> list[_Hypothesis]
     ]
 
 
-def _odd_row(values: FloatArray, is_odd: BoolArray, kind: str) -> _Hypothesis:
+def _odd_row(values: FloatArray, least: float, most: float, kind: str) -> _Hypothesis:
     """Return that a single row, the first, is impossible."""
-    row = int(np.argmax(is_odd))
+    is_odd = bool(values.min() < least or values.max() > most)
+    row = int(np.argmax((values < least) | (values > most))) if is_odd else 0
     cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
-    return is_odd[row], float(values[row]), f"row {row + 1} is not {kind}", cure, []
+    return is_odd, float(values[row]), f"row {row + 1} is not {kind}", cure, []
 
 
 def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Hypothesis:

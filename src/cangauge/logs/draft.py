@@ -202,6 +202,8 @@ class DraftLog:
 
     def _drop_repeated(self) -> None:
         time = self.values["time_s"]
+        if np.all(time[1:] > time[:-1]):
+            return
         step = np.diff(time, prepend=-np.inf)
         back = np.flatnonzero(step < 0.0)
         if back.size:
@@ -212,8 +214,6 @@ class DraftLog:
             cure = "sort the rows by time" if 2 * back.size > step.size else cure
             raise self.error("time_s", problem, cure, float(time[row]))
         repeats = step == 0.0
-        if not repeats.any():
-            return
         row = int(np.argmax(repeats))
         differs = np.any([np.diff(v, prepend=v[0]) != 0.0 for v in self.values.values()], axis=0)
         count = int(np.sum(repeats & differs))

@@ -167,7 +167,7 @@ def _charge(log: Log, taken_ah: FloatArray) -> SignEvidence:
         return SignEvidence("charge", 0.0, "no voltage trend over charge")
     rank = correlation(_ranks(taken), _ranks(voltage))
     weight = 3.0 if abs(rank) >= 0.9 else 1.5 if abs(rank) >= 0.7 else 0.0
-    if span_v < 0.05 * float(np.median(log.voltage_v)):
+    if span_v < 0.05 * float(np.median(voltage)):
         weight = 0.0
     text = f"voltage against charge taken out: rank correlation {rank:+.2f}"
     return SignEvidence("charge", -float(np.sign(rank)) * weight, text)

@@ -59,8 +59,6 @@ _MONTHS: Final = {
     for name in names.split("/")
 }
 _ORDERS: Final = ("ymd", "dmy", "mdy")
-_LEAST_EPOCH: Final = 1e11
-"""Least number that is ticks since a date: milliseconds, of 1973."""
 _DIGITS: Final = r"^(19|20)?\d{2}(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}$"
 """`20240313235000` and `240313235000`."""
 
@@ -136,7 +134,8 @@ def seconds_of(
     if digits is not None:
         return seconds_of_text(digits, order_or_zone, source, label)
     unit = "" if is_format else unit
-    return _seconds_of_numbers(values * factor, unit or in_cells, source, label)
+    values = values if factor == 1.0 else values * factor
+    return _seconds_of_numbers(values, unit or in_cells, source, label)
 
 
 def _zone_of(name: str) -> ZoneInfo | None:
@@ -150,12 +149,13 @@ def _zone_of(name: str) -> ZoneInfo | None:
 
 def _spelled_in_digits(values: FloatArray) -> Any:
     """Return numbers that spell dates as text, or None."""
-    known = np.isfinite(values) & (np.abs(values) < 1e15)
-    if not known.any() or np.any(values[known] < _LEAST_EPOCH / 10.0):
+    if not np.nanmin(values, initial=np.inf) >= 1e10:
         return None
+    known = values < 1e15
     digits = pa.array(np.where(known, values, 0.0).astype(np.int64), mask=~known).cast(pa.string())
     are_dates = pc.all(pc.match_substring_regex(digits, _DIGITS)).as_py()
-    return digits if are_dates and np.all(values[known] % 1.0 == 0.0) else None
+    is_whole = known.any() and np.all(values[known] % 1.0 == 0.0)
+    return digits if are_dates and is_whole else None
 
 
 def _seconds_of_numbers(
@@ -163,27 +163,31 @@ def _seconds_of_numbers(
 ) -> tuple[FloatArray, str]:
     if unit:
         return values * (unit_of("time_s", unit) or (1.0, 0.0))[0], unit
-    values = np.where(np.isfinite(values), values, np.nan)
-    finite = values[np.isfinite(values)]
-    typical = float(np.median(finite)) if finite.size else 0.0
+    is_known = np.isfinite(values)
+    finite = values[is_known]
+    sample = finite[:: 1 + finite.size // 10_000]
+    typical = float(np.median(sample)) if sample.size else 0.0
     first_s, last_s = LIMITS["can_logs_s"]
     for name, (tick_s, origin_s) in EPOCHS.items():
         if first_s <= typical * tick_s - origin_s <= last_s:
             ticks = values - origin_s / tick_s  # before scaling: 100 ns of 2000 years need 63 bits
             return ticks * tick_s, f"{name}, from its size"
-    if typical >= _LEAST_EPOCH:
+    if typical >= 1e11:  # milliseconds, of 1973
         cure = f"state it: --columns 'time={label}[?]', with s, ms, us, ns, min, h or d for ?"
         problem = "the unit of time is not stated, and no epoch has a year of 1991 to 2099"
         raise InputError(problem, source=source, field=label, value=typical, cure=cure)
-    hours, minutes, seconds = values // 10_000.0, values // 100.0 % 100.0, values % 100.0
-    spells = (hours >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
-    clock_s = over_midnight(hours * 3600.0 + minutes * 60.0 + seconds)
-    # A count of seconds has some of 60 to 99 of each hundred; a clock has none, and no gap there.
-    steps, clock_steps = np.diff(finite), np.diff(clock_s[np.isfinite(values)])
-    usual = float(np.median(steps)) if steps.size else np.inf
-    jumps = (np.abs(steps) > 40.0) & (clock_steps > 0.0) & (clock_steps <= 2.0 * usual)
-    if usual < 40.0 and jumps.any() and np.all(spells | np.isnan(values)):
-        return clock_s, "hhmmss, from its digits"
+    steps = np.abs(np.diff(finite))
+    if np.any(steps > 40.0) and np.median(steps) < 40.0:
+        # A count of seconds has some of 60 to 99 of each hundred; a clock none, and no gap there.
+        hours, minutes, seconds = finite // 10_000.0, finite // 100.0 % 100.0, finite % 100.0
+        spells = (hours >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
+        clock_s = over_midnight(hours * 3600.0 + minutes * 60.0 + seconds)
+        clock_steps = np.diff(clock_s)
+        is_near = (clock_steps > 0.0) & (clock_steps <= 2.0 * np.median(steps))
+        if spells.all() and np.any((steps > 40.0) & is_near):
+            of_day_s = np.full(values.size, np.nan)
+            of_day_s[is_known] = clock_s
+            return of_day_s, "hhmmss, from its digits"
     return values, "s, assumed"
 
 

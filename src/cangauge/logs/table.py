@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import repeat
+from itertools import zip_longest
 from typing import Any, Final
 
 import numpy as np
@@ -94,7 +94,7 @@ def draft_of_table(
     InputError
         If a column is not found, or holds anything but values of its quantity.
     """
-    where, headings = source or name, list(table.headings)
+    where, headings = source or name, [*table.headings]
     choice = choose_columns(headings, table.units, given)
     if choice.is_canonical:
         refuse_odd_names(headings, where)
@@ -103,26 +103,18 @@ def draft_of_table(
     chosen = choice.chosen
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
-    wanted += [place for place, _ in chosen["time"].others] + words
-    counters = _counters(table, wanted) if "soc" in chosen and not choice.is_canonical else {}
-    wanted += counters
-    cells = table.columns([*dict.fromkeys(wanted)])
+    wanted += [*words, *(place for place, _ in chosen["time"].others)]
+    counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, wanted)
+    cells = table.columns([*dict.fromkeys([*wanted, *counters])])
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
-    time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
-    draft.values["time_s"] = time_s
-    draft.stated = {FIELDS[quantity] for quantity, column in chosen.items() if column.is_stated}
-    if unit_of_time == "s, assumed":
-        draft.in_seconds = False if "time_s" in draft.stated else None
-    elif unit_of("time_s", unit_of_time) is None:  # dates, clock times, ticks since a date
-        draft.in_seconds = True
-    for quantity, column in chosen.items():
-        joint = " − " if quantity == "current" else " + "
-        label = joint.join(headings[place] for place in column.places)
-        draft.labels[FIELDS[quantity]] = label
-        unit = unit_of_time if quantity == "time" else _take(draft, quantity, column, cells)
-        factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
-        shown = label if len(label) <= 80 else f"{label[:80]}…"
+    for quantity in chosen:
+        take = _take_time if quantity == "time" else _take
+        column, unit = take(draft, quantity, chosen[quantity], cells)
+        chosen[quantity] = column
         if not choice.is_canonical:
+            factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
+            label = draft.labels[FIELDS[quantity]]
+            shown = label if len(label) <= 80 else f"{label[:80]}…"
             draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
     for place, scale in counters.items():
         with suppress(InputError):  # a column of words
@@ -130,29 +122,23 @@ def draft_of_table(
             draft.values[f"{COUNTER}{headings[place]}"] = count * scale
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
-    in_cells = _only_word(cells[words[0]], where) if words else ""
-    in_metadata = getattr(table, "word", "") if choice.is_canonical else ""
-    in_heading = chosen["temperature"].source if "temperature" in chosen else "unknown"
-    word = in_cells or in_metadata or in_heading
+    word: str = chosen["temperature"].source if "temperature" in chosen else "unknown"
+    if choice.is_canonical:
+        word = table.word or word
+    for place in words:
+        word = _only_word(cells[place], where) or word
     draft.temperature_source = known_temperature_source(word, source=where)
     if not choice.is_canonical:
-        current = chosen["current"]
-        if current.factor > 0.0 and len(current.places) == 1:
-            draft.sign_by = "data"
-            if not np.any(draft.values["current_a"] < 0.0):
-                direct_by_state(draft, table)
+        _direct(draft, chosen["current"], table)
         _hold_changes(draft)
     return draft
 
 
 def _counters(table: TextTable | ArrowTable, taken: Sequence[int]) -> dict[int, float]:
     """Return columns that may count the charge, with their factor to Ah; few, as pairs count."""
-    units = [*table.units, *repeat("", len(table.headings))]
-    found = {
-        place: scale
-        for place, heading in enumerate(table.headings)
-        if place not in taken and (scale := charge_scale(heading, units[place])) is not None
-    }
+    units = zip_longest(table.headings, table.units[: len(table.headings)], fillvalue="")
+    scales = {place: charge_scale(*each) for place, each in enumerate(units)}
+    found = {k: scale for k, scale in scales.items() if scale is not None and k not in taken}
     return found if len(found) <= MAX_COUNTERS else {}
 
 
@@ -165,38 +151,44 @@ def _only_word(column: Any, where: str) -> str:
     return words.pop() if words else ""
 
 
-def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]) -> str:
-    """Take a quantity in its canonical unit; return the unit that was read or assumed."""
+def _take(
+    draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]
+) -> tuple[ChosenColumn, str]:
+    """Take a quantity in its canonical unit; return its column, and how the unit was found."""
     name, where, unit = FIELDS[quantity], draft.where, column.unit
-    headings = [draft.headings[place] for place in column.places]
-    read = [
-        numbers_of(cells[place], where, heading)
-        for place, heading in zip(column.places, headings, strict=True)
-    ]
-    for in_cells in sorted({unit for _, unit in read if unit}):
-        if unit and unit_of(name, in_cells) != unit_of(name, unit):
+    texts = _label(draft, name, column, " − " if quantity == "current" else " + ")
+    read = [numbers_of(cells[k], where, text) for k, text in zip(column.places, texts, strict=True)]
+    for _, in_cells in read:
+        if in_cells and unit and unit_of(name, in_cells) != unit_of(name, unit):
             problem = "the cells have another unit than the heading"
             cure = f"state the right one: --columns '{quantity}=HEADING[UNIT]'"
             raise draft.error(name, problem, cure, f"{in_cells}, heading {unit}")
         unit = unit or in_cells
-    parts = [numbers for numbers, _ in read]
-    if column.factor != 1.0:
-        parts = [numbers * column.factor for numbers in parts]
-    shown = unit or f"{QUANTITIES[quantity].unit}, assumed"
+    parts = [numbers if column.factor == 1.0 else numbers * column.factor for numbers, _ in read]
+    how = unit or f"{QUANTITIES[quantity].unit}, assumed"
     if quantity == "soc":
-        finite = parts[0][np.isfinite(parts[0])]
-        is_fraction = np.any(finite % 1.0) and finite.min() >= 0.0 and finite.max() <= 1.0
-        if not unit and is_fraction:  # 1, then 0, may also be an empty pack's percents
-            unit, shown = "0-1", "0–1, from its range"
-        elif _LEAF_SPY.issubset(draft.headings) and np.nanmedian(finite) > 110.0:
-            draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
-            unit = "0.0001%"
+        unit, how = _unit_of_soc(draft, parts[0], unit, how)
     parts = [convert(part, name, unit, source=where, label=draft.labels[name]) for part in parts]
-    if quantity == "temperature":
-        draft.take_probes(headings, parts)
-        return f"{shown}, the median" if len(parts) > 1 else shown
-    draft.values[name] = parts[0] if len(parts) == 1 else _discharge_less_charge(draft, parts)
-    return shown
+    if len(parts) == 1:
+        draft.values[name] = parts[0]
+    elif quantity == "temperature":
+        draft.take_probes(texts, parts)
+        how = f"{how}, the median"
+    else:
+        draft.values[name] = _discharge_less_charge(draft, parts)
+    return column, how
+
+
+def _unit_of_soc(draft: DraftLog, soc: FloatArray, unit: str, how: str) -> tuple[str, str]:
+    """Return the unit of a SoC by its range, if nothing states it or LeafSpy wrote it."""
+    finite = soc[np.isfinite(soc)]
+    is_within_1 = finite.size and finite.min() >= 0.0 and finite.max() <= 1.0
+    if is_within_1 and not unit and np.any(finite % 1.0):  # 1, then 0, may be percents too
+        return "0-1", "0–1, from its range"
+    if _LEAF_SPY.issubset(draft.headings) and np.nanmedian(finite) > 110.0:
+        draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
+        return "0.0001%", how
+    return unit, how
 
 
 def _discharge_less_charge(draft: DraftLog, parts: Sequence[FloatArray]) -> FloatArray:
@@ -208,6 +200,14 @@ def _discharge_less_charge(draft: DraftLog, parts: Sequence[FloatArray]) -> Floa
     return np.abs(parts[0]) - np.abs(parts[1])
 
 
+def _direct(draft: DraftLog, column: ChosenColumn, table: TextTable | ArrowTable) -> None:
+    """Note what tells the sign of current; a negative factor and a pair of directions do."""
+    if column.factor > 0.0 and len(column.places) == 1:
+        draft.sign_by = "data"
+        if not np.any(draft.values["current_a"] < 0.0):
+            direct_by_state(draft, table)
+
+
 def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
     """Make an unsigned current negative where a column of words says that it charges.
 
@@ -216,7 +216,7 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
     InputError
         If the words do not tell the direction of each current.
     """
-    current, headings = draft.values["current_a"], list(draft.headings)
+    current, headings = draft.values["current_a"], [*draft.headings]
     places = [
         place
         for place, text in enumerate(headings)
@@ -231,65 +231,74 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         is_direction = "direction" in headings[place].lower() and len(pc.unique(cells)) > 1
         if not (charges.any() and discharges.any()) and not is_direction:
             continue
-        unclear = (current > 0.0) & (charges == discharges)
-        if unclear.any():
-            row = int(np.argmax(unclear))
+        unclear = np.flatnonzero((current > 0.0) & (charges == discharges))
+        if unclear.size:
+            row = int(unclear[0])
             lacks = "does not say whether the unsigned current charges or discharges"
-            problem = f"row {row + 1} {lacks}"
             cure = "write it as charge or discharge, or give the current a sign"
-            raise draft.error(headings[place], problem, cure, cells[row].as_py())
+            raise draft.error(headings[place], f"row {row + 1} {lacks}", cure, cells[row].as_py())
         draft.values["current_a"] = np.where(charges, -current, current)
         draft.sign_by = "format"
         draft.assumed.append(f'current charges where "{headings[place]}" says so')
         return
 
 
-def _time(
-    cells: dict[int, Any], column: ChosenColumn, headings: Sequence[str], where: str
-) -> tuple[FloatArray, str, ChosenColumn]:
-    """Return time [s], how it was read, and its column; of several, the first that increases."""
+def _take_time(
+    draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]
+) -> tuple[ChosenColumn, str]:
+    """Take the time [s]; return its column and its reading; of several, one that increases.
+
+    A date beside a clock time is read with it, unless the user named the clock.
+    """
+    name, where = FIELDS[quantity], draft.where
 
     def read(column: ChosenColumn) -> tuple[FloatArray, str]:
-        label = " + ".join(headings[place] for place in column.places)
+        _label(draft, name, column, " + ")
         parts = [cells[place] for place in column.places]
+        label = draft.labels[name]
         return seconds_of(parts, column.unit, column.factor, source=where, label=label)
 
-    date = _date_beside(cells, column)
-    if date is not None:
-        column = replace(column, places=(date, *column.places), others=())
+    others = sorted(column.others)
+    if others and is_clock(first_text(cells[column.places[0]])):
+        for date in [place for place, _ in others if _is_date(first_text(cells[place]))][:1]:
+            column, others = replace(column, places=(date, *column.places)), []
     time_s, how = read(column)
-    others = [item for item in column.others if item[1].rank < Rank.GUESS]
-    for place, meaning in () if _increases(time_s) else others:
+    for place, meaning in column.others if others and not _increases(time_s) else ():
         other = replace(column, places=(place,), unit=meaning.unit)
         with suppress(InputError):
-            other_s, other_how = read(other)
-            if _increases(other_s):
-                return other_s, other_how, other
-    finite = time_s[np.isfinite(time_s)]
-    if finite.size > 1 and np.ptp(finite) == 0.0:
-        label = " + ".join(headings[place] for place in column.places)
-        problem = "this column does not move: it is no time"
+            if meaning.rank < Rank.GUESS and _increases(read(other)[0]):
+                column, (time_s, how) = other, read(other)
+                break
+    _label(draft, name, column, " + ")
+    known_s = time_s[np.isfinite(time_s)]
+    if known_s.size > 1 and known_s.min() == known_s.max():
         cure = "name another one: --columns time=…"
-        value = float(finite[0])
-        raise InputError(problem, source=where, field=label, value=value, cure=cure)
-    return time_s, how, column
+        raise draft.error(name, "this column does not move: it is no time", cure, float(known_s[0]))
+    draft.values[name] = time_s
+    if how == "s, assumed":
+        draft.in_seconds = False if column.is_stated else None
+    elif unit_of(name, how) is None:  # dates, clock times, ticks since a date
+        draft.in_seconds = True
+    return column, how
 
 
-def _date_beside(cells: dict[int, Any], column: ChosenColumn) -> int | None:
-    """Return the column of dates beside one of clock times, unless the user named that one."""
-    if not column.others or not is_clock(first_text(cells[column.places[0]])):
-        return None
-    for place in sorted(place for place, _ in column.others):
-        text = first_text(cells[place])
-        if ":" not in text and not is_number(text) and is_stamp(text):
-            return place
-    return None
+def _label(draft: DraftLog, name: str, column: ChosenColumn, joint: str) -> list[str]:
+    """Note the headings of a quantity, and whether the user states its unit; return them."""
+    texts = [draft.headings[place] for place in column.places]
+    draft.labels[name] = joint.join(texts)
+    if column.is_stated:
+        draft.stated.add(name)
+    return texts
+
+
+def _is_date(text: str) -> bool:
+    return ":" not in text and not is_number(text) and is_stamp(text)
 
 
 def _increases(time_s: FloatArray) -> bool:
-    finite = time_s[np.isfinite(time_s)]
-    steps = np.diff(finite)
-    return steps.size > 0 and bool(np.all(steps >= 0.0)) and float(np.median(steps)) > 0.0
+    """Return whether times never fall, and rise from most rows to the next."""
+    steps = np.diff(time_s[np.isfinite(time_s)])
+    return bool(np.all(steps >= 0.0)) and 2 * int(np.count_nonzero(steps)) > steps.size
 
 
 def _hold_changes(draft: DraftLog) -> None:
@@ -312,9 +321,10 @@ def _hold_changes(draft: DraftLog) -> None:
     is_known = np.isfinite(temperature)
     if is_known.any():  # before the first value, the first
         temperature[~is_known] = temperature[is_known][0]
-    latest = f"the latest voltage (at most {float(age_s[near].max()):.2g} s old) and temperature"
-    kept = f"{at.size} rows with a current kept, with {latest}"
-    draft.remarks.append(f"rows hold only what changed: {kept}")
+    draft.remarks.append(
+        f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
+        f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
+    )
 
 
 def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -42,6 +42,7 @@ class TextTable(NamedTuple):
     units: Sequence[str]
     skip_lines: int
     remarks: list[str]
+    word: str = ""
 
     def columns(self, places: Sequence[int]) -> dict[int, Any]:
         """Read columns, as `read_cells`.
@@ -66,7 +67,10 @@ class TextTable(NamedTuple):
             pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines),
             pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip),
             pacsv.ConvertOptions(
-                include_columns=[*types], column_types=types, strings_can_be_null=True
+                include_columns=[*types],
+                column_types=types,
+                strings_can_be_null=True,
+                check_utf8=False,  # `as_utf8` has
             ),
         )
         data = as_utf8(self.head.read())

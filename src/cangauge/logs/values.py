@@ -43,8 +43,8 @@ def is_text(column: Any) -> bool:
 
 def first_text(column: Any) -> str:
     """Return the first value of a column of text; "" of any other."""
-    known = column.drop_null() if is_text(column) else ()
-    return str(known[0].as_py()) if len(known) else ""
+    known = column.drop_null()[:1].to_pylist() if is_text(column) else []
+    return str(known[0]) if known else ""
 
 
 def read_cells(columns: Mapping[int, Any], headings: Sequence[str]) -> dict[int, Any]:
