@@ -72,7 +72,7 @@ def live_and_recorded(
             recorder.on_frame(message)
             if part_bytes and number % 100 == 0:
                 recorder.on_snapshot(SNAPSHOT)
-                assert waits(lambda: recorder.state.frames == number + 1)  # noqa: B023
+                assert waits(lambda: recorder.state["frames"] == number + 1)  # noqa: B023
             if pipeline.handle(message):
                 live.append(pipeline.latest)
         if pipeline.finish():
@@ -102,7 +102,7 @@ def test_a_recording_gives_the_live_numbers(
     messages = [m for n, m in enumerate(messages) if m.arbitration_id != 0x401 or n % 3]
     pipeline, sent = Pipeline(Vehicle.load(preset), leaf_model()), expected(messages)
     live, recorder = live_and_recorded(tmp_path / f"x{suffix}", messages, pipeline, part_bytes)
-    assert (recorder.state.lost_frames, recorder.state.frames) == (0, len(messages))
+    assert (recorder.state["lost_frames"], recorder.state["frames"]) == (0, len(messages))
     if part_bytes:
         assert recorder.written == tmp_path / f"x-0001{suffix}"
         assert len(parts_of_run(recorder.written)) >= 3
@@ -172,7 +172,7 @@ def test_an_old_part_that_cannot_be_removed_ends_no_start(tmp_path: Path) -> Non
         recorder = Recorder(tmp_path / "r.log", 1000.0, 1000.0)
         recorder.on_frame(can.Message())
         recorder.close()
-    assert recorder.state.lost_frames == 1
+    assert recorder.state["lost_frames"] == 1
     assert any("writing is retried" in line for line in logged.lines)
 
 
@@ -211,19 +211,19 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
     messages = frames(60.0)
     with Recorder(tmp_path / "drive.log") as recorder:
         write(recorder, messages[:400])
-        assert waits(lambda: recorder.state.frames == 400)
+        assert waits(lambda: recorder.state["frames"] == 400)
         is_full.set()
         write(recorder, messages[400:800])
-        assert waits(lambda: recorder.state.frames == 800)
+        assert waits(lambda: recorder.state["frames"] == 800)
         assert recorder.state is not None
-        assert recorder.state.problem == "No space left on device"
+        assert recorder.state["problem"] == "No space left on device"
         is_full.clear()
         write(recorder, messages[800:])
-        assert waits(lambda: recorder.state.frames == len(messages))
-        assert (recorder.state.problem, recorder.state.lost_frames) == (None, 400)
+        assert waits(lambda: recorder.state["frames"] == len(messages))
+        assert (recorder.state["problem"], recorder.state["lost_frames"]) == (None, 400)
         is_full.set()
         write(recorder, messages[:100])
-    assert recorder.state.lost_frames == 500
+    assert recorder.state["lost_frames"] == 500
     # The file is whole lines: a part in the middle is missing, and nothing else.
     assert content(recorder.written) == expected(messages[:400] + messages[800:])
     events = [getattr(each, "event", "") for each in caplog.records]
@@ -256,17 +256,17 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
     messages = frames(20.0)
     with Recorder(folder / "drive.log", part_bytes=2_000) as recorder:
         write(recorder, messages[:100])
-        assert waits(lambda: recorder.state.frames == 100)
+        assert waits(lambda: recorder.state["frames"] == 100)
         folder.rename(tmp_path / "gone")
         write(recorder, messages[100:200])
-        assert waits(lambda: recorder.state.frames == 200)
+        assert waits(lambda: recorder.state["frames"] == 200)
         assert recorder.state is not None
-        assert recorder.state.problem == "No such file or directory"
+        assert recorder.state["problem"] == "No such file or directory"
         (tmp_path / "gone").rename(folder)
         write(recorder, messages[200:])
-    assert recorder.state.problem is None
-    assert 0 < recorder.state.lost_frames <= 100
-    assert len(content(recorder.written)) == len(messages) - recorder.state.lost_frames
+    assert recorder.state["problem"] is None
+    assert 0 < recorder.state["lost_frames"] <= 100
+    assert len(content(recorder.written)) == len(messages) - recorder.state["lost_frames"]
 
 
 CHILD = """
@@ -280,7 +280,7 @@ with Recorder(sys.argv[1]) as recorder:
         ))
         if number % 50 == 49:
             recorder.on_snapshot(Snapshot(0.0, {}))
-            while recorder.state.frames <= number:
+            while recorder.state["frames"] <= number:
                 time.sleep(0.001)
             print(number, flush=True)
 """

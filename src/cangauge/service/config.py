@@ -38,6 +38,7 @@ from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
 from cangauge.errors import InputError
 from cangauge.service.events import LogFormat, LogLevel
+from cangauge.service.status_client import value_at
 from cangauge.settings import (
     GAP_S,
     START_STD_PCT,
@@ -419,36 +420,31 @@ def load_config(
     the file. An InputError names the file (or the option), the key and the value.
     """
     given = {name: value for name, value in (overrides or {}).items() if value not in (None, {})}
-    _check_options(given)  # separately, so that an error names the source of the value
     data = {} if path is None else read_toml(path)
-    validated(RunConfig, {"model": "-", **data}, path or "")
     for place in [name for name, key in config_keys().items() if key.get("is_path")]:
-        *tables, name = place.split(".")
-        table = data
-        for each in tables:
-            table = table.get(each, {})
-        if path is not None and name in table:
-            table[name] = str(Path(path).parent / table[name])
+        table, _, name = place.rpartition(".")
+        values = data.get(table) if table else data
+        if isinstance(values, dict) and isinstance(file := values.get(name), str):
+            values[name] = str(Path(path or "").parent / file)
     if given.keys() & {"vehicle", "dbc", "map"}:  # replaces the file's vehicle as a whole
         data = {name: data[name] for name in data if name not in {"vehicle", "dbc", "map"}}
+    merged = data | given
     for name in given.keys() & {"ids", "bus_options"}:
-        given[name] = {**data.get(name, {}), **given[name]}
-    merged = {**data, **given}
+        if isinstance(data.get(name), dict):
+            merged[name] = data[name] | given[name]
     if "model" not in merged:
         field = "-m/--model" if path is None else "model"
         cure = "give -m MODEL (made by `cangauge fit`)"
         raise InputError("is missing", source=path, field=field, cure=cure)
-    config = validated(RunConfig, merged, path or "")
-    return config if path is None else config.named(path, given)
-
-
-def _check_options(given: Mapping[str, Any]) -> None:
     try:
-        validated(RunConfig, {"model": "-", **given}, "")
+        config = validated(RunConfig, merged, path or "")
     except InputError as error:
-        key = config_keys().get(error.field or "", {})
-        option = key.get("option", error.field or "").rpartition(", ")[2]
+        field = error.field or ""
+        if value_at(given, field) is None:
+            raise
+        option = config_keys().get(field, {}).get("option", field).rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
+    return config if path is None else config.named(path, given)
 
 
 # --- Description of the keys

@@ -17,10 +17,9 @@ import logging
 import os
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import can
 
@@ -42,20 +41,6 @@ SYNC_EVERY_S: Final = 30.0
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class RecordState:
-    """Progress of a recording: its current file; frames, and those of them that were not written.
-
-    `problem` is why the disk rejects data at present.
-    """
-
-    path: str
-    frames: int = 0
-    lost_frames: int = 0
-    written_bytes: int = 0
-    problem: str | None = None
-
-
 class Recorder(Output):
     """The recording of a service: one file, or parts.
 
@@ -73,8 +58,6 @@ class Recorder(Output):
 
     Attributes
     ----------
-    state : RecordState
-        Progress.
     written : Path
         The recording, for `estimate`.
 
@@ -92,11 +75,22 @@ class Recorder(Output):
     ) -> None:
         check_recording(Path(path), part_bytes, keep_bytes)
         self._batch: list[can.Message] = []
-        self._lost_frames = 0
-        self._file = file = _RecordFile(Path(path), part_bytes, keep_bytes)
-        self.state = RecordState(str(file.current))
-        self.written = file.path
+        self._frames = self._refused_frames = self._unwritten_frames = 0
+        self._problem: str | None = None
+        self._file = _RecordFile(Path(path), part_bytes, keep_bytes)
+        self.written = self._file.path
         self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Current file; frames so far, and those lost; `problem`: why the disk rejects data now."""
+        return {
+            "path": str(self._file.current),
+            "frames": self._frames,
+            "lost_frames": self._refused_frames + self._unwritten_frames,
+            "written_bytes": self._file.written_bytes,
+            "problem": self._problem,
+        }
 
     def on_frame(self, message: can.Message) -> None:
         """Record a frame, and round its stamp to the one that is written."""
@@ -114,32 +108,30 @@ class Recorder(Output):
         self._hand_over()
         self._worker.submit(self._file.close)
         if not self._worker.close(CLOSE_WITHIN_S):
-            text = f"{self.state.path}: the end of the recording is missing"
+            text = f"{self._file.current}: the end of the recording is missing"
             emit(_LOG, logging.ERROR, "record.incomplete", text)
 
     def _hand_over(self) -> None:
         batch, self._batch = self._batch, []
         if batch and not self._worker.submit(partial(self._write, batch)):
-            self._lost_frames += len(batch)  # counted with the next batch that is taken
+            self._refused_frames += len(batch)
 
     # --- In the thread
 
     def _write(self, batch: list[can.Message]) -> None:
-        file, before = self._file, self.state
-        lost, self._lost_frames = before.lost_frames + self._lost_frames, 0
-        problem = None
+        before, problem = self._problem, None
         try:
-            file.write(batch)
+            self._file.write(batch)
         except OSError as error:
             problem = error.strerror or str(error)
-            lost += len(batch)
-        self.state = RecordState(
-            str(file.current), before.frames + len(batch), lost, file.written_bytes, problem
-        )
+            self._unwritten_frames += len(batch)
+        self._problem = problem
+        self._frames += len(batch)
+        lost = self.state["lost_frames"]
         if problem is not None:
             text = f"recording: {problem}; the estimate continues, writing is retried"
             self._say(logging.ERROR, "record.failed", text, lost)
-        elif before.problem is not None:
+        elif before is not None:
             text = f"recording resumed; {lost} frames were lost"
             self._say(logging.WARNING, "record.resumed", text, lost)
 

@@ -91,9 +91,11 @@ class Service:
             else partial(load_config, config, options)
         )
         config = self._read()
+        limits_mb = config.record_part_mb, config.record_keep_mb
+        self._record_limits = [None if each is None else 1e6 * each for each in limits_mb]
         with config.naming_keys():
             self._state = state_path(config.state, os.environ)
-            _check_files(config, self._state)
+            self._check_files(config)
             self._setup = setup = Setup.of(config)
             self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
             self.address = address_of(config)
@@ -144,12 +146,12 @@ class Service:
                     stack.enter_context(sole_writer(owned))
             port = stack.enter_context(ReconnectingBus(self.address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
-            keeper = None
+            checkpoint = None
             if self._state is not None:
                 keeper = StateKeeper(self._state, pipeline, port.name, config.state_max_age_s)
-                stack.enter_context(keeper)
+                checkpoint = stack.enter_context(keeper).checkpoint
             if config.record is not None:
-                self.recorder = Recorder(config.record, *_recording_limits(config))
+                self.recorder = Recorder(config.record, *self._record_limits)
                 self._outputs.insert(0, self.recorder)
             for output in self._outputs:
                 stack.callback(output.close)
@@ -178,13 +180,13 @@ class Service:
                 config,
                 outputs=self._outputs,
                 monitor=monitor,
-                checkpoint=None if keeper is None else keeper.checkpoint,
+                checkpoint=checkpoint,
                 reload=partial(self._poll_reload, monitor),
             )
             loop.run(self._is_done)
         recording = None if self.recorder is None else str(self.recorder.written)
-        used_s = {"cpu_seconds": time.process_time() - began_s}
-        status = monitor.final() | used_s | {"recording": recording}
+        cpu_s = time.process_time() - began_s
+        status = monitor.final() | {"cpu_seconds": cpu_s, "recording": recording}
         log_end(status)
         return status
 
@@ -213,28 +215,37 @@ class Service:
 
     def _poll_reload(self, monitor: Monitor) -> RunConfig | None:
         """Begin to read on request, in a thread; return the new configuration once it is in use."""
-        if self._reading is None:
-            if self._is_reload_due:
-                self._is_reload_due = False
-                reading: Future[Setup | CangaugeError] = Future()
-                self._reading = reading
-                monitor.reload_begins()
+        if self._reading is None and self._is_reload_due:
+            self._is_reload_due = False
+            self._reading = reading = Future[Setup | CangaugeError]()
+            monitor.reload_begins()
 
-                def read() -> None:
-                    reading.set_result(read_setup(self._read))
+            def read() -> None:
+                reading.set_result(read_setup(self._read))
 
-                try:
-                    start_thread(read, "cangauge-reload")
-                except CangaugeError as error:
-                    reading.set_result(error)
-            return None
-        if not self._reading.done():
+            try:
+                start_thread(read, "cangauge-reload")
+            except CangaugeError as error:
+                reading.set_result(error)
+        if self._reading is None or not self._reading.done():
             return None
         problem = self.apply(self._reading.result())
         self._reading = None
         monitor.model, monitor.sign_cure = self.config.model, self._setup.sign_cure
         monitor.reload_ends(problem)
         return self.config if problem is None else None
+
+    def _check_files(self, config: RunConfig) -> None:
+        """Raise InputError if state or recording cannot be written, or if two files are one."""
+        if self._state is not None:
+            for other in filter(None, (config.model, config.record, config.dbc, config.map)):
+                if os.path.realpath(other) == os.path.realpath(self._state):
+                    raise InputError(
+                        "is another file of this service", field="--state", value=other
+                    )
+            check_writable(self._state)
+        if config.record is not None:
+            check_recording(Path(config.record), *self._record_limits)
 
 
 def log_end(status: Mapping[str, Any]) -> None:
@@ -261,39 +272,20 @@ def log_end(status: Mapping[str, Any]) -> None:
         emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
 
 
-def _check_files(config: RunConfig, state: Path | None) -> None:
-    """Raise InputError if state or recording cannot be written, or if two files are one."""
-    if state is not None:
-        for other in filter(None, (config.model, config.record, config.dbc, config.map)):
-            if os.path.realpath(other) == os.path.realpath(state):
-                raise InputError("is another file of this service", field="--state", value=other)
-        check_writable(state)
-    if config.record is not None:
-        check_recording(Path(config.record), *_recording_limits(config))
-
-
-def _recording_limits(config: RunConfig) -> list[float | None]:
-    """Return the largest size of a part, and of all parts together [bytes]."""
-    limits_mb = config.record_part_mb, config.record_keep_mb
-    return [None if each is None else 1e6 * each for each in limits_mb]
-
-
 def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path | None:
     """Open the status socket; return its path, or None if it is off or not to be had."""
     if config.status_socket == "off":
         return None
-    if config.status_socket != "auto":
-        path = Path(config.status_socket)
-        stack.enter_context(closing(StatusSocket(path, monitor.now)))
-        return path
-    path = socket_path(monitor.latest.status["bus"])
+    is_asked_for = config.status_socket != "auto"
+    bus = monitor.latest.status["bus"]
+    path = Path(config.status_socket) if is_asked_for else socket_path(bus)
     try:
-        server = StatusSocket(path, monitor.now)
+        stack.enter_context(closing(StatusSocket(path, monitor.now)))
     except CangaugeError as error:
-        # Not requested explicitly: the service runs without it.
+        if is_asked_for:
+            raise
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
         return None
-    stack.enter_context(closing(server))
     return path
 
 

@@ -119,32 +119,32 @@ def inverter_address(publish: PublishConfig) -> BusAddress:
 
 def _check_publish(config: RunConfig) -> None:
     """Raise InputError if an inverter cannot be told the SoC."""
-    publish, problem = config.publish, ""
+    publish = config.publish
     if publish is None:
         return
-    buses, field, value = (address_of(config), inverter_address(publish)), "", ""
     if config.time_source == "replay-clock":
-        field, value = "time_source", config.time_source
-        problem, cure = "the SoC of a replay is not the battery's", "remove it, or [publish]"
-    elif str(buses[0]) == str(buses[1]):
+        raise InputError(
+            "the SoC of a replay is not the battery's",
+            source=config.file,
+            field="time_source",
+            value=config.time_source,
+            cure="remove it, or [publish]",
+        )
+    battery, inverter = address_of(config), inverter_address(publish)
+    if str(battery) == str(inverter):
         problem = "is the battery's bus: a frame cannot be replaced on the bus that carries it"
         cure = "connect the inverter to a bus of its own"
-    elif any(bus.echoes for bus in buses):
+    elif battery.echoes or inverter.echoes:
         problem = "a bus returns the frames sent on it: they would go round for ever"
         cure = "use SocketCAN on both buses, and remove receive_own_messages"
-    if problem:
-        raise InputError(
-            problem,
-            source=config.file,
-            field=field or "publish.channel",
-            value=value or publish.channel,
-            cure=cure,
-        )
+    else:
+        return
+    field, value = "publish.channel", publish.channel
+    raise InputError(problem, source=config.file, field=field, value=value, cure=cure)
 
 
 def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
     """Raise InputError if `[poll]` is given where nothing can be asked for."""
-    problem = ""
     if config.poll is None:
         return
     if not vehicle.poll_targets:
@@ -158,8 +158,9 @@ def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
     elif config.bus_options.get("listen_only"):
         problem = "a bus that only listens sends no requests"
         cure = "remove listen_only from [bus_options], or [poll]"
-    if problem:
-        raise InputError(problem, source=config.file, field="poll", cure=cure)
+    else:
+        return
+    raise InputError(problem, source=config.file, field="poll", cure=cure)
 
 
 def _sign_cure(config: RunConfig, vehicle: Vehicle) -> str:

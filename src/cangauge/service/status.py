@@ -11,7 +11,7 @@ import math
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Final
 
@@ -248,7 +248,7 @@ class Monitor:
             "config": self._config,
             "latency": self._latency.to_dict(),
             "step": self._step.to_dict(),
-            "record": None if record is None else asdict(record) | {"path": _as_utf8(record.path)},
+            "record": record and record | {"path": _as_utf8(record["path"])},
         }
 
     def _line(self) -> str:

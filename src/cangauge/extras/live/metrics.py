@@ -6,7 +6,8 @@ import math
 import os
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from itertools import accumulate
 from typing import Any, Final
 
 from cangauge.errors import InputError
@@ -31,6 +32,18 @@ except ImportError as error:
     ) from error
 
 _GAUGES: Final = {
+    "start_s": ("start_time_seconds", "Start time, seconds since 1970."),
+    "is_config_used": (
+        "config_last_reload_successful",
+        "0 if the latest configuration was refused and the one before it is in use.",
+    ),
+    "loop_age_s": ("loop_age_seconds", "Time since the latest turn of the receive loop."),
+    "bus_up": ("bus_up", "0 while the bus is lost or its controller is bus-off."),
+    "sample_age_s": (
+        "sample_age_seconds",
+        "Age of the latest sample; infinite before the first.",
+    ),
+    "is_record_failing": ("record_failing", "1 while the disk rejects data."),
     "estimate.soc_pct": ("soc_percent", "State of charge [%]."),
     "estimate.soc_std_pct": ("soc_std_percent", "Standard deviation of the SoC [%]."),
     "estimate.soc_newton_pct": ("soc_newton_percent", "SoC by the inverse voltage model [%]."),
@@ -104,7 +117,7 @@ _HISTOGRAMS: Final = {
 }
 
 
-def render(status: Mapping[str, Any], accept: str) -> tuple[bytes, str]:
+def render(status: dict[str, Any], accept: str) -> tuple[bytes, str]:
     """Return the text for a status and its content type, as the Accept header asks for."""
     registry = CollectorRegistry()
     registry.register(_Status(status))
@@ -114,11 +127,11 @@ def render(status: Mapping[str, Any], accept: str) -> tuple[bytes, str]:
 
 
 class _Status(Collector):
-    def __init__(self, status: Mapping[str, Any]) -> None:
+    def __init__(self, status: dict[str, Any]) -> None:
         self._status = status
 
     def collect(self) -> Iterator[Metric]:
-        status = self._status
+        status, record = self._status, self._status["record"]
         names = ("version", "bus", "vehicle", "model", "method", "time_source")
         labels = {"python": platform.python_version()} | {name: status[name] for name in names}
         build = GaugeMetricFamily(
@@ -126,78 +139,40 @@ class _Status(Collector):
         )
         build.add_metric([*labels.values()], 1.0)
         yield build
-        age_s = None if status["sample"] is None else status["sample"]["age_s"]
-        for name, text, value in (
-            (
-                "start_time_seconds",
-                "Start time, seconds since 1970.",
-                time.time() - status["uptime_s"],
-            ),
-            (
-                "config_last_reload_successful",
-                "0 if the latest configuration was refused and the one before it is in use.",
-                status["config"]["problem"] is None,
-            ),
-            (
-                "loop_age_seconds",
-                "Time since the latest turn of the receive loop.",
-                status["loop_age_s"],
-            ),
-            ("bus_up", "0 while the bus is lost or its controller is bus-off.", status["bus_up"]),
-            (
-                "sample_age_seconds",
-                "Age of the latest sample; infinite before the first.",
-                math.inf if age_s is None else age_s,
-            ),
-        ):
-            yield GaugeMetricFamily(f"cangauge_{name}", text, value)
-        for key, (name, text) in _GAUGES.items():
-            if status[key.partition(".")[0]] is not None:
-                yield GaugeMetricFamily(f"cangauge_{name}", text, _number(status, key))
-        for key, (name, text) in _COUNTERS.items():
-            if not math.isnan(value := _number(status, key)):
+        age_s = value_at(status, "sample.age_s")
+        values = status | {
+            "start_s": time.time() - status["uptime_s"],
+            "is_config_used": status["config"]["problem"] is None,
+            "sample_age_s": math.inf if age_s is None else age_s,
+            "is_record_failing": None if record is None else record["problem"] is not None,
+        }
+        for place, (name, text) in _GAUGES.items():
+            if values[place.partition(".")[0]] is not None:
+                value = value_at(values, place)
+                yield GaugeMetricFamily(
+                    f"cangauge_{name}", text, math.nan if value is None else value
+                )
+        for place, (name, text) in _COUNTERS.items():
+            if (value := value_at(status, place)) is not None:
                 yield CounterMetricFamily(f"cangauge_{name}", text, value)
-        if (record := status["record"]) is not None:
-            is_failing = record["problem"] is not None
-            text = "1 while the disk rejects data."
-            yield GaugeMetricFamily("cangauge_record_failing", text, is_failing)
-        gauge, counter = GaugeMetricFamily, CounterMetricFamily
         statuses = {each.name.lower(): each.name.lower() == status["status"] for each in Status}
-        yield _labelled(gauge, "status", "1 for the present status.", "status", statuses)
         reasons = {name: name in status["reasons"] for name in reason_ids(~Reason.NONE)}
-        yield _labelled(gauge, "reason", "1 for present reasons.", "reason", reasons)
-        text = "Rejected frames and values, by reason."
-        yield _labelled(counter, "rejects", text, "reason", status["rejects"])
-        if status["polls"] is not None:
-            text = "Requests over ISO-TP, and what came of them."
-            yield _labelled(counter, "polls", text, "kind", status["polls"])
+        rejected = "Rejected frames and values, by reason."
+        asked = "Requests over ISO-TP, and what came of them."
+        for kind, name, text, label, counts in (
+            (GaugeMetricFamily, "status", "1 for the present status.", "status", statuses),
+            (GaugeMetricFamily, "reason", "1 for present reasons.", "reason", reasons),
+            (CounterMetricFamily, "rejects", rejected, "reason", status["rejects"]),
+            (CounterMetricFamily, "polls", asked, "kind", status["polls"] or {}),
+        ):
+            family = kind(f"cangauge_{name}", text, labels=[label])
+            for key, value in counts.items():
+                family.add_metric([key], value)
+            if counts:
+                yield family
         for key, (name, text) in _HISTOGRAMS.items():
-            yield _histogram(f"cangauge_{name}", text, status[key])
-
-
-def _number(status: Mapping[str, Any], key: str) -> float:
-    """Return the number of a dotted key; NaN where it is not known."""
-    value = value_at(status, key)
-    return math.nan if value is None else float(value)
-
-
-def _labelled(
-    kind: type[GaugeMetricFamily | CounterMetricFamily],
-    name: str,
-    text: str,
-    label: str,
-    values: Mapping[str, float],
-) -> Metric:
-    family = kind(f"cangauge_{name}", text, labels=[label])
-    for key, value in values.items():
-        family.add_metric([key], value)
-    return family
-
-
-def _histogram(name: str, text: str, histogram: Mapping[str, Any]) -> Metric:
-    total = 0
-    buckets: list[tuple[str, float]] = []
-    for bound, count in zip((*BOUNDS_S, math.inf), histogram["buckets"], strict=True):
-        total += count
-        buckets.append(("+Inf" if math.isinf(bound) else repr(bound), float(total)))
-    return HistogramMetricFamily(name, text, buckets=buckets, sum_value=histogram["total_s"])
+            bounds = [*map(repr, BOUNDS_S), "+Inf"]
+            buckets = [*zip(bounds, accumulate(status[key]["buckets"]), strict=True)]
+            yield HistogramMetricFamily(
+                f"cangauge_{name}", text, buckets=buckets, sum_value=status[key]["total_s"]
+            )
