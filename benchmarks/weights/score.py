@@ -13,9 +13,7 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
-from cangauge.diagnosis.evidence import learn
 from cangauge.diagnosis.posterior import ALARM, ALIKE, Posterior, features, shipped_weights
-from cangauge.diagnosis.rows import trace
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -62,7 +60,7 @@ def _examples_of(split: Split) -> list[Example]:
             chemistry=split.chemistry,
             cells=split.cells,
         ).model
-        healthy = learn(model, [trace(log, split.capacity_ah) for log in split.references])
+        healthy = learn_references(split.references, model)
         return [_example(split, case.logs, case.truth, model, healthy) for case in split.cases]
 
 

@@ -279,8 +279,8 @@ def test_of_two_stated_faults_the_likelier_corrects(
     found = diagnose([more_volts(day(seed), 5.0) for seed in (20, 21)], model, known)
     both = judged(found, **{likelier: 0.55, other: 0.45})
     assert both.correction is not None
-    assert both.correction.fault == both.posterior.stated[0]
-    assert both.extended_rmse_v == both.corrections[both.correction.fault].rmse_v
+    assert both.correction.evidence.fault == both.posterior.stated[0]
+    assert both.extended_rmse_v == both.corrections[both.correction.evidence.fault].rmse_v
     words = {"initial_soc": "wrong start", "voltage_offset": "voltage reading"}
     assert f"with the {words[likelier]} corrected (" in both.summary
     assert f"with the {words[other]})" in both.summary
@@ -305,7 +305,7 @@ def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:
 
 def test_a_sentence_has_the_sign_of_its_unit(healthy: Diagnosis) -> None:
     for of in healthy.evidence.values():
-        said = sentence(of, healthy.healthy.linear.pack, "It", 80.0)
+        said = sentence(of, healthy.healthy.model.pack, "It", 80.0)
         assert "ohm" not in said
         assert " 1 (" not in said
 

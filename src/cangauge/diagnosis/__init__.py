@@ -32,7 +32,7 @@ The method is described in docs/diagnosis.md.
 from cangauge.diagnosis.diagnose import Diagnosis, diagnose, learn_references
 from cangauge.diagnosis.pack import Healthy
 from cangauge.diagnosis.posterior import ALARM, FAULTS, NONE, UNKNOWN, Posterior
-from cangauge.diagnosis.where import LogErrors
+from cangauge.diagnosis.where import Errors
 
 __all__ = [
     "ALARM",
@@ -40,8 +40,8 @@ __all__ = [
     "NONE",
     "UNKNOWN",
     "Diagnosis",
+    "Errors",
     "Healthy",
-    "LogErrors",
     "Posterior",
     "diagnose",
     "learn_references",

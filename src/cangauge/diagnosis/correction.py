@@ -5,40 +5,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from cangauge._typing import BoolArray
 from cangauge._version import __version__
 from cangauge.diagnosis.evidence import Evidence
 from cangauge.diagnosis.pack import LogRows
 from cangauge.diagnosis.rows import Simulated, added
 from cangauge.diagnosis.sizes import SizeProfile
-from cangauge.diagnosis.where import LogErrors, rms
+from cangauge.diagnosis.where import Errors, rms
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 
 
-def errors_without(
-    given: ExtendedModel, logs: Sequence[LogRows]
-) -> tuple[list[Simulated], list[LogErrors]]:
-    """Return each log as the given model predicts it, and its errors on the rows that count."""
-    of_logs = [Simulated(given, log.trace) for log in logs]
-    errors = []
-    for log, of in zip(logs, of_logs, strict=True):
-        at = log.trace.rows[log.kept]
-        signals = of.signals
-        before_v = of.plain.residual_v[log.kept]
-        errors.append(
-            LogErrors(
-                log.trace.name,
+def errors_of(given: Sequence[Simulated], logs: Sequence[LogRows]) -> Errors:
+    """Return the errors of simulated logs on the rows that count."""
+    parts = []
+    for k, (log, of) in enumerate(zip(logs, given, strict=True)):
+        at, signals = log.trace.rows[log.kept], of.signals
+        parts.append(
+            (
+                np.full(at.size, k),
                 signals.time_s[at] - signals.time_s[0],
                 signals.current_a[at],
                 signals.temperature_c[at],
                 of.plain.soc_pct[at],
-                before_v,
-                before_v,
+                of.plain.residual_v[log.kept],
+                of.plain.residual_v[log.kept],
             )
         )
-    return of_logs, errors
+    return Errors(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,62 +45,52 @@ class Correction:
     Parameters
     ----------
     evidence : Evidence
-    errors : list of LogErrors
+    errors : Errors
         Before and after, on the rows that count, sized without them.
     """
 
     evidence: Evidence
-    errors: list[LogErrors] = field(repr=False)
+    errors: Errors = field(repr=False)
 
     @classmethod
     def of(
         cls,
-        parts: Sequence[tuple[SizeProfile, list[BoolArray]]],
+        evidence: Evidence,
+        folds: Sequence[tuple[SizeProfile, list[BoolArray]]],
         logs: Sequence[LogRows],
         given: Sequence[Simulated],
-        without: Sequence[LogErrors],
-        evidence: Evidence,
+        without: Errors,
     ) -> Correction:
         """Return the correction by an effect, judged on parts of logs that did not size it."""
-        bound = evidence.shape.bound
-        after = [each.before_v.copy() for each in without]
-        for profile, judged in parts:
-            size = profile.newton(evidence, evidence.size / bound) * bound
-            for k, rows in enumerate(judged):
-                shape = evidence.shape_in(k, logs[k])
+        after_v = [errors.before_v for errors in without.by_log]
+        for profile, judged in folds:
+            size = profile.sized(evidence)
+            for k, (shape, rows) in enumerate(zip(evidence.shapes, judged, strict=True)):
                 if shape is not None and rows.any():
                     found = given[k].with_effect(shape.effect, shape.values(size))
-                    after[k][rows] = found.residual_v[logs[k].kept][rows]
-        errors = [replace(each, after_v=v) for each, v in zip(without, after, strict=True)]
-        return cls(evidence, errors)
+                    after_v[k] = np.where(rows, found.residual_v[logs[k].kept], after_v[k])
+        return cls(evidence, replace(without, after_v=np.concatenate(after_v)))
 
     @property
     def rmse_v(self) -> float:
         """Error of the corrected model [V]."""
-        return rms(self.errors, after=True)
+        return rms(self.errors.after_v)
 
     @property
     def is_better(self) -> bool:
         """Whether the error of rows that did not size it is smaller with it."""
-        return self.rmse_v < rms(self.errors)
-
-    @property
-    def fault(self) -> str:
-        """The fault that it corrects."""
-        return self.evidence.fault
+        return self.rmse_v < rms(self.errors.before_v)
 
     @property
     def is_of_log(self) -> bool:
         """Whether it belongs to these logs and not to the pack."""
-        return self.fault == "start"
+        return self.evidence.fault == "start"
 
     def applied(self, given: ExtendedModel) -> ExtendedModel:
         """Return the model for later logs: a step that has happened persists."""
-        if self.is_of_log:
-            return given
         shape = self.evidence.shape
         if shape.place is not None:
-            shape = shape.at(0.0, 0.0)
+            shape = replace(shape, place=0.0).in_log(0.0)
         return added(given, shape.effect, shape.values(self.evidence.size))
 
 

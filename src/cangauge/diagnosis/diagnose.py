@@ -16,7 +16,7 @@ from cangauge._extras import extra
 from cangauge.diagnosis import text
 from cangauge.diagnosis.as_json import as_json
 from cangauge.diagnosis.checks import check_logs
-from cangauge.diagnosis.correction import Correction, errors_without, model_file
+from cangauge.diagnosis.correction import Correction, errors_of, model_file
 from cangauge.diagnosis.evidence import Evidence, analyse, learn
 from cangauge.diagnosis.faults import FAULT, sentence
 from cangauge.diagnosis.model_check import ModelCheck, check_model
@@ -25,12 +25,13 @@ from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
 from cangauge.diagnosis.posterior import ALARM, Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
-from cangauge.diagnosis.sizes import held_out, simulated
-from cangauge.diagnosis.where import LogErrors, closed_part, excesses, rms
+from cangauge.diagnosis.sizes import folds, sized_by_simulation
+from cangauge.diagnosis.where import Errors, closed_part, excesses, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log, as_log
+from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model, as_model
 
@@ -72,11 +73,15 @@ class Diagnosis:
     """Whether the model describes the references; None with fewer than two."""
     remarks: tuple[str, ...] = ()
     """What was assumed to diagnose these logs."""
-    has_references: bool = True
     simulator: SimulatorGap | None = None
     """The simulator whose gap it is; None: the gap of `model`."""
     correction_path: str | None = None
     """File of the corrected model, as the text names it."""
+
+    @property
+    def has_references(self) -> bool:
+        """Whether references show what a healthy log is."""
+        return bool(self.healthy.references)
 
     @property
     def lacks(self) -> bool:
@@ -86,28 +91,28 @@ class Diagnosis:
     @cached_property
     def _healthy_extended(self) -> ExtendedModel:
         """The model as given, extended by the effects that it misses on the healthy logs."""
-        if self.model_check is not None and self.lacks:
-            return self.model_check.corrected
-        return self.model.extended_model()
+        check = self.model_check
+        return self.model.extended_model() if check is None else check.corrected
 
     @cached_property
-    def _before_correction(self) -> tuple[list[Simulated], list[LogErrors]]:
-        """Each diagnosed log as the model of the healthy logs predicts it, and its errors."""
-        return errors_without(self._healthy_extended, self.rows)
+    def _baseline(self) -> Errors:
+        """Errors by the model as given."""
+        return errors_of(self._simulated(self.model.extended_model()), self.rows)
 
     @cached_property
-    def _baseline(self) -> list[LogErrors]:
-        """Errors of each log by the model as given."""
-        if not self.lacks:
-            return self._before_correction[1]
-        return errors_without(self.model.extended_model(), self.rows)[1]
+    def _uncorrected(self) -> Errors:
+        """Errors by the model of the healthy logs."""
+        return errors_of(self._simulated(self._healthy_extended), self.rows)
+
+    def _simulated(self, model: ExtendedModel) -> list[Simulated]:
+        return [Simulated(model, log.trace) for log in self.rows]
 
     @cached_property
     def corrections(self) -> dict[str, Correction]:
         """Fault → its best effect, judged on rows that did not size it."""
-        parts, (given, without) = held_out(self.healthy, self.rows), self._before_correction
+        parts, given = folds(self.healthy, self.rows), self._simulated(self._healthy_extended)
         return {
-            fault: Correction.of(parts, self.rows, given, without, self.best_of(fault))
+            fault: Correction.of(self.best_of(fault), parts, self.rows, given, self._uncorrected)
             for fault in self.posterior.faults
         }
 
@@ -118,7 +123,7 @@ class Diagnosis:
     def sentence(self, evidence: Evidence, model: ExtendedModel | None = None) -> str:
         """Return what an effect does to a model and how much, without the end of the sentence."""
         log = "The log" if len(self.rows) == 1 else "The first log"
-        pack = (model or self.healthy.linear.model).pack
+        pack = (model or self.healthy.model).pack
         return sentence(evidence, pack, log, self.rows[0].trace.start_pct)
 
     @cached_property
@@ -183,38 +188,32 @@ class Diagnosis:
 
     def _soc_error_pct(self, model: Model) -> float | None:
         """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None."""
-        errors = [np.zeros(0)]
+        errors: list[float] = []
         for log, rows in zip(self.logs, self.rows, strict=True):
             if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
                 continue
-            finite, at_1_hz = np.isfinite(log.soc_pct), replace(rows.trace.log, soc_pct=None)
-            table = estimate(at_1_hz, model, initial_soc_pct="auto")
-            own = np.interp(table.time_s, log.time_s[finite], log.soc_pct[finite])
+            known = np.isfinite(log.soc_pct)
+            table = estimate(replace(rows.trace.log, soc_pct=None), model, initial_soc_pct="auto")
+            own = np.interp(table.time_s, log.time_s[known], log.soc_pct[known])
             settled = table.time_s - table.time_s[0] >= SETTLING_S
-            errors.append(np.abs(table.soc_pct - own)[np.isfinite(table.soc_pct) & settled])
-        together = np.concatenate(errors)
-        return float(together.mean()) if together.size else None
+            errors += np.abs(table.soc_pct - own)[np.isfinite(table.soc_pct) & settled].tolist()
+        return float(np.mean(errors)) if errors else None
 
     @property
-    def log_errors(self) -> list[LogErrors]:
-        """Errors of each diagnosed log, before and after."""
-        corrected = (
-            self._before_correction[1] if self.correction is None else self.correction.errors
-        )
-        return [
-            replace(before, after_v=log.after_v)
-            for before, log in zip(self._baseline, corrected, strict=True)
-        ]
+    def errors(self) -> Errors:
+        """Errors on the rows that count, by the model as given and by the corrected one."""
+        corrected = self._uncorrected if self.correction is None else self.correction.errors
+        return replace(self._baseline, after_v=corrected.after_v)
 
     @property
     def baseline_rmse_v(self) -> float:
         """Error of the given model [V]."""
-        return rms(self._baseline)
+        return rms(self._baseline.before_v)
 
     @property
     def extended_rmse_v(self) -> float:
         """Error of the corrected model on rows that did not size the correction [V]."""
-        return rms(self.log_errors, after=True)
+        return rms(self.errors.after_v)
 
     @property
     def healthy_rmse_v(self) -> float:
@@ -229,7 +228,7 @@ class Diagnosis:
         """
         if not self.is_corrected:
             return None, None
-        return closed_part(self.log_errors, self.healthy.healthy_v2)
+        return closed_part(self.errors, self.healthy.healthy_v2)
 
     @cached_property
     def where(self) -> list[dict[str, Any]]:
@@ -260,7 +259,7 @@ class Diagnosis:
         of = self.evidence[effect]
         size, unit = of.visible, of.shape.unit
         if effect == "resistance_growth":
-            size, unit = size * self.healthy.linear.pack.resistance_ohm, "ohm"
+            size, unit = size * self.healthy.model.pack.resistance_ohm, "ohm"
         return (size if of.visible <= of.shape.bound else None), unit
 
     @cached_property
@@ -275,7 +274,8 @@ class Diagnosis:
         """The model that describes the healthy logs: the given one where nothing is missed."""
         if not self.lacks:
             return self.model
-        return model_file(self.model, self._healthy_extended, rms(self._before_correction[1]))
+        left_v = rms(self._uncorrected.before_v)
+        return model_file(self.model, self._healthy_extended, left_v)
 
     def _file(self, correction: Correction) -> Model:
         """Return the model of the healthy logs with a correction."""
@@ -378,10 +378,8 @@ def diagnose(
             healthy = learn(model, of_references)
         _LOG.info("comparing the effects")
         check = check_model(model, healthy) if len(healthy.references) > 1 else None
-        rows = tuple(
-            log_rows(healthy.linear, log, healthy.tried, healthy.visited) for log in traces
-        )
-        evidence = simulated(healthy, rows, analyse(healthy, rows))
+        rows = tuple(log_rows(healthy.model, log, healthy.tried, healthy.visited) for log in traces)
+        evidence = sized_by_simulation(healthy, rows, analyse(healthy, rows))
         found = Diagnosis(
             logs=logs,
             references=own,
@@ -392,7 +390,6 @@ def diagnose(
             posterior=posterior(healthy, rows, evidence, alarm),
             model_check=check,
             remarks=tuple(remarks),
-            has_references=bool(healthy.references),
             simulator=simulator,
         )
         _LOG.info("judging on held-out rows")
@@ -417,14 +414,14 @@ def _traces(
     """Return the logs at 1 Hz, and a sentence for each start found from the voltage."""
     traces, remarks = [], []
     for log in logs:
-        start = start_pct
-        if start is None and log.first_soc() is None:
+        start = soc_at_first_row(log, model.capacity_ah) if start_pct is None else start_pct
+        if start is None:
             by_voltage = start_by_model(log, model)
-            start = by_voltage.soc_pct
+            start, std = by_voltage.soc_pct, by_voltage.std_pct or 0.0
             remarks.append(
-                f"{log.name} states no SoC: its start of {start:.1f} ±"
-                f" {by_voltage.std_pct or 0.0:.1f} % was found from the voltage. A fault that"
-                " shifts the voltage as a whole may hide in it; --initial-soc states the start."
+                f"{log.name} states no SoC: its start of {start:.1f} ± {std:.1f} % was found from"
+                " the voltage. A fault that shifts the voltage as a whole may hide in it;"
+                " --initial-soc states the start."
             )
-        traces.append(trace(log, model.capacity_ah, start))
+        traces.append(trace(log, start))
     return traces, remarks

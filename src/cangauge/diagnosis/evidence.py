@@ -9,9 +9,18 @@ from typing import Final
 
 import numpy as np
 
-from cangauge.diagnosis.pack import RIDGE, Healthy, LogRows, correct, of_model, total, total_s
+from cangauge._typing import IntArray
+from cangauge.diagnosis.pack import (
+    RIDGE,
+    Healthy,
+    LogRows,
+    corrected_by,
+    of_model,
+    total,
+    total_s,
+)
 from cangauge.diagnosis.rows import COVER_PCT, Trace
-from cangauge.diagnosis.shapes import PLACES, Shape
+from cangauge.diagnosis.shapes import Shape
 from cangauge.model.gaussian import Rows
 from cangauge.model.model_file import Model
 
@@ -22,9 +31,6 @@ TWO_SIDED, SHAPE_STD = 1.96, 0.05
 """Standard deviations of a 95 % interval, and the relative uncertainty of a size by its shape: it
 is the library's and not the pack's, and sizes of development cases were off by 1 to 15 %."""
 
-Places = tuple[float | None, ...]
-"""Where a shape begins in each log, in parts of it: 0 is from its first row on, None never."""
-
 
 @dataclass(frozen=True)
 class Quantity:
@@ -33,21 +39,22 @@ class Quantity:
     Parameters
     ----------
     value : float
-    unit : str
     ci : (float, float), optional
         None for a shape.
+    unit : str
     """
 
     value: float
-    unit: str
     ci: tuple[float, float] | None
+    unit: str
 
 
 @dataclass(frozen=True)
 class Evidence:
     """Evidence of one effect at its best shape and size, in logs that share one cause."""
 
-    shape: Shape
+    shapes: tuple[Shape | None, ...]
+    """Its shape in each log; None before a step of resistance."""
     nats: float
     """n_k/o_k: gain of log likelihood over the excess that references show [nats]."""
     left_v2: float
@@ -60,9 +67,13 @@ class Evidence:
     """Smallest size that would have been visible."""
     chi2: float
     """χ² (one degree of freedom) of its most significant shape: about 1 without the effect."""
-    places: Places
     bounds: tuple[float, float]
     """Lowest and highest amplitude relative to neutral, in units of the shape's larger bound."""
+
+    @property
+    def shape(self) -> Shape:
+        """The shape in the first log that has it."""
+        return next(filter(None, self.shapes))
 
     @property
     def fault(self) -> str:
@@ -73,86 +84,84 @@ class Evidence:
     def parameters(self) -> dict[str, Quantity]:
         """Parameters of the effect, with the 95 % interval of its amplitude."""
         half = TWO_SIDED * float(np.hypot(self.std, SHAPE_STD * self.size))
-        found = {}
-        for item in self.shape.effect.parameters:
-            value = self.shape.values(self.size)[item.name]
-            ci = (value - half, value + half) if item.name == self.shape.name else None
-            found[item.name] = Quantity(value, item.unit, ci)
+        shape, found = self.shape, {}
+        values = shape.values(self.size)
+        for item in shape.effect.parameters:
+            value = values[item.name]
+            ci = (value - half, value + half) if item.name == shape.name else None
+            found[item.name] = Quantity(value, ci, item.unit)
         return found
-
-    def shape_in(self, number: int, log: LogRows) -> Shape | None:
-        """Return the shape in one of the logs; None before a step of resistance."""
-        part = self.places[number]
-        if part is None or self.shape.place is None:
-            return None if part is None else self.shape
-        return self.shape.at(part, log.trace.log.duration_s)
 
 
 def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
-    """Return the evidence of every effect in logs that share one cause, to first order."""
-    trials = _trials(healthy.tried, len(logs))
-    at = np.array([columns for columns, _ in trials]).T
-    tried = [healthy.tried[max(columns)] for columns, _ in trials]
-    n = healthy.n
-    tables = [np.insert(healthy.known.table, [n] * len(tried), 0.0, axis=1)]
-    for log, column in zip(logs, at, strict=True):
-        table = healthy.rows_of(log).table
-        shapes = np.where(column >= 0, table[:, n + column], 0.0)
-        tables.append(np.column_stack([table[:, :n], shapes, table[:, -1]]))
-        beyond, std = healthy.own_soc(log, log.of.plain.soc_pct)
-        if beyond:
-            counts = np.where(column >= 0, log.count_by_shape[column], 0.0)
-            tables.append(np.r_[np.zeros(n), counts / std, beyond][None, :])
-    rows = Rows(np.concatenate(tables), 0.0).reduced()
+    """Return the evidence of every effect in logs that share one cause, to first order.
+
+    Each shape is weighed by itself beside δ: its size by ridge regression within its bounds. The
+    best one stands for its effect.
+    """
+    at = _trials(healthy.tried, len(logs))
+    tried = [healthy.tried[k] for k in at.max(axis=1)]
+    n, rows = healthy.n, _design(healthy, logs, at)
     left = rows.eliminated(n).table
     g, s = left[:, :-1].T @ left[:, -1], np.maximum(np.sum(left[:, :-1] ** 2, axis=0), 1e-9)
     bounds = np.array([_bounds(shape, logs) for shape in tried])
     size = np.clip(g / (s + RIDGE), *bounds.T)
     gain = g * size - 0.5 * s * size**2
+    chi2 = g**2 / (s + RIDGE)
     R = np.asarray(np.linalg.qr(rows.table, mode="r"), dtype=np.float64)
     solved = np.linalg.solve(R[:n, :n], R[:n, n:])
     found = {}
     names = np.array([shape.effect.id for shape in tried])
     for name in dict.fromkeys(names.tolist()):
-        mine = np.flatnonzero(names == name)
+        mine, o = np.flatnonzero(names == name), healthy.excess_of(name)
         top = int(mine[np.argmax(gain[mine])])
-        shape, places, o = tried[top], trials[top][1], healthy.excess_of(name)
-        if shape.place is not None:
-            duration_s = logs[places.count(None)].trace.log.duration_s
-            shape = shape.at(shape.place, duration_s)
-        delta = solved[:, -1] - solved[:, top] * size[top]
-        square_v2 = sum(
-            healthy.square_v2(log, delta, int(column), float(size[top]))
-            for log, column in zip(logs, at[:, top], strict=True)
-        )
+        bound, delta = tried[top].bound, solved[:, -1] - solved[:, top] * size[top]
+        columns = list(zip(logs, at[top].tolist(), strict=True))
+        square_v2 = sum(healthy.square_v2(log, delta, k, float(size[top])) for log, k in columns)
         visible = np.sqrt(2.0 * VISIBLE_NATS * o / s[mine]) * [tried[j].bound for j in mine]
         found[name] = Evidence(
-            shape=shape,
+            tuple(
+                None if k < 0 else healthy.tried[k].in_log(log.trace.log.duration_s)
+                for log, k in columns
+            ),
             nats=float(gain[top]) / o,
             left_v2=square_v2 / total_s(logs),
-            size=float(size[top]) * shape.bound,
-            std=float(np.sqrt(o / (s[top] + RIDGE))) * shape.bound,
+            size=float(size[top]) * bound,
+            std=float(np.sqrt(o / (s[top] + RIDGE))) * bound,
             visible=float(visible.min()),
-            chi2=float(np.max(g[mine] ** 2 / (s[mine] + RIDGE))),
-            places=places,
+            chi2=float(chi2[mine].max()),
             bounds=(float(bounds[top, 0]), float(bounds[top, 1])),
         )
     return found
 
 
-def _trials(tried: Sequence[Shape], logs: int) -> list[tuple[list[int], Places]]:
-    """Return what is tried on some logs: the column in each log, −1 for none, and its places.
+def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> Rows:
+    """Return the rows of δ and of each trial: of the references, the logs, and their own SoC."""
+    n, number = healthy.n, len(at)
+    tables = [np.insert(healthy.delta.table, [n] * number, 0.0, axis=1)]
+    for log, column in zip(logs, at.T, strict=True):
+        table = healthy.rows_of(log).table
+        shapes = np.where(column >= 0, table[:, n + column], 0.0)
+        tables.append(np.column_stack([table[:, :n], shapes, table[:, -1]]))
+        beyond, std = healthy.own_soc(log, log.simulated.plain.soc_pct)
+        if beyond:
+            counts = np.where(column >= 0, log.count_by_shape[column], 0.0)
+            tables.append(np.r_[np.zeros(n), counts / std, beyond][None, :])
+    return Rows(np.concatenate(tables), 0.0).reduced()
+
+
+def _trials(tried: Sequence[Shape], logs: int) -> IntArray:
+    """Return the column of each trial in each log, −1 for none, shape (trials, logs).
 
     A step of resistance happens at one place of one log and lasts through the later ones.
     """
-    plain = [k for k, shape in enumerate(tried) if shape.place is None]
-    first, *steps = (k for k, shape in enumerate(tried) if shape.place is not None)
-    trials: list[tuple[list[int], Places]] = [([k] * logs, (0.0,) * logs) for k in plain]
-    for before, (k, part) in itertools.product(range(logs), zip(steps, PLACES[1:], strict=True)):
-        after = logs - before - 1
-        places = (None,) * before + (part,) + (0.0,) * after
-        trials.append(([-1] * before + [k] + [first] * after, places))
-    return trials
+    plain = [[k] * logs for k, shape in enumerate(tried) if shape.place is None]
+    first, *steps = range(len(plain), len(tried))
+    later = [
+        [-1] * before + [step] + [first] * (logs - before - 1)
+        for before, step in itertools.product(range(logs), steps)
+    ]
+    return np.array(plain + later)
 
 
 def _bounds(shape: Shape, logs: Sequence[LogRows]) -> tuple[float, float]:
@@ -168,30 +177,37 @@ def _bounds(shape: Shape, logs: Sequence[LogRows]) -> tuple[float, float]:
 
 def learn(model: Model, references: Sequence[Trace]) -> Healthy:
     """Return what references, logs without a fault, show; of the model alone without any."""
+    stated_v = model.noise.voltage_rmse_v
     if not references:
-        return of_model(model)
-    healthy, logs, counts = correct(model, references)
-    every = [healthy.rows_of(log).with_columns(range(healthy.n)) for log in logs]
-    plain, judged, left_out = replace(healthy, excess={"": 1.0}), [], []
-    for k, log in enumerate(logs):
-        if counts[k]:
-            others = replace(plain, known=total(healthy.known, every[:k] + every[k + 1 :]))
-            judged.append((others.gap_v2([log]), others.open_v2([log])))
-            left_out.append(analyse(others, [log]))
-    known = total(healthy.known, every)
+        return of_model(model, stated_v)
+    healthy, logs, is_judged = corrected_by(references, model)
+    every = [healthy.delta_rows_of(log) for log in logs]
+    left_out = [
+        (log, replace(healthy, delta=total(healthy.delta, every[:k] + every[k + 1 :])))
+        for k, log in enumerate(logs)
+        if is_judged[k]
+    ]
+    healthy = replace(healthy, delta=total(healthy.delta, every))
     if len(left_out) < 2:
-        stated_v2 = model.noise.voltage_rmse_v**2
-        return replace(healthy, known=known, s2=max(healthy.s2, stated_v2))
-    chi2 = {name: np.array([one[name].chi2 for one in left_out]) for name in left_out[0]}
+        return replace(healthy, s2=max(healthy.s2, stated_v**2))
+    return _calibrated(healthy, left_out)
+
+
+def _calibrated(healthy: Healthy, left_out: Sequence[tuple[LogRows, Healthy]]) -> Healthy:
+    """Return the healthy pack with what left-out references show by the others: error and excess.
+
+    `left_out` holds each reference, and the healthy pack without it.
+    """
+    found = [analyse(replace(others, excess={"": 1.0}), [log]) for log, others in left_out]
+    chi2 = {name: np.array([one[name].chi2 for one in found]) for name in found[0]}
     usual = max(1.0, float(np.median([x.mean() for x in chi2.values()])))
-    # Two more references of the usual χ² keep the mean of few from being far off.
+    # The mean of few references may be far off: two more that show the usual χ² of all effects,
+    # as a conjugate prior of that weight, draw it there.
     excess = {k: max((x.sum() + 2.0 * usual) / (len(x) + 2.0), usual) for k, x in chi2.items()}
-    nats = [max(0.0, *(e.nats / excess[name] for name, e in one.items())) for one in left_out]
     return replace(
         healthy,
-        known=known,
-        mean_squares_v2=tuple(gap_v2 for gap_v2, _ in judged),
-        mean_open_v2=float(np.mean([open_v2 for _, open_v2 in judged])),
-        nats=tuple(nats),
+        mean_squares_v2=tuple(others.gap_v2([log]) for log, others in left_out),
+        mean_open_v2=float(np.mean([others.open_v2([log]) for log, others in left_out])),
+        nats=tuple(max(0.0, *(e.nats / excess[name] for name, e in one.items())) for one in found),
         excess=excess,
     )

@@ -134,7 +134,7 @@ def sentence(evidence: Evidence, pack: Pack, log: str, start_pct: float) -> str:
         "size": _shown(item, 1.0, shown_unit(item.unit)),
         "percent": _shown(item, 100.0, "%"),
         "milli": _shown(item, 1e3, f"m{item.unit}"),
-        "lost": _shown(Quantity(1.0 - value, "1", (1.0 - high, 1.0 - low)), 100.0, "%"),
+        "lost": _shown(Quantity(1.0 - value, (1.0 - high, 1.0 - low), "1"), 100.0, "%"),
         "at_pack_v": _shown(item, pack.voltage_v / 100.0, "V"),
         "at_pack_ohm": _shown(item, pack.resistance_ohm, "Ω"),
         "of_voltage": number(100.0 * abs(value) / pack.voltage_v, 1, "%"),

@@ -12,7 +12,8 @@ from cangauge.diagnosis.evidence import Evidence, analyse
 from cangauge.diagnosis.pack import Healthy, log_rows, of_model
 from cangauge.diagnosis.posterior import Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, added
-from cangauge.diagnosis.sizes import simulated
+from cangauge.diagnosis.sizes import sized_by_simulation
+from cangauge.diagnosis.where import rms
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
@@ -22,8 +23,6 @@ BEYOND: Final = 2.0
 error among themselves, and the uncertainty that the model file states."""
 OF_LOGS: Final = ("start", "clock")
 """Faults of logs, not of a model."""
-EFFECTS_AT_MOST: Final = 3
-"""Effects that a model may lack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,49 +68,49 @@ class ModelCheck:
 
 
 def check_model(model: Model, healthy: Healthy) -> ModelCheck:
-    """Return what a model misses on references, two at least."""
-    among_v, references = healthy.rmse_v, healthy.references
-    now, extended = model, model.extended_model()
-    expected_v = _expected_v(model, healthy)
+    """Return what a model misses on references, two at least: three effects at most."""
+    references, expected_v = healthy.references, _expected_v(model, healthy)
+    models = [model.extended_model()]
+    errors_v = [_rmse_v(models[0], references)]
     found: list[Missed] = []
-    models, errors_v = [extended], [_rmse_v(extended, references)]
-    while errors_v[-1] > BEYOND * expected_v and len(found) < EFFECTS_AT_MOST:
+    while errors_v[-1] > BEYOND * expected_v and len(found) < 3:
+        now = model.model_copy(update={"effects": effect_entries(models[-1].effects)})
         alone = replace(
-            of_model(now, among_v),
+            of_model(now, healthy.rmse_v),
             mean_squares_v2=healthy.mean_squares_v2,
             nats=healthy.nats,
             excess=healthy.excess,
         )
-        logs = [log_rows(alone.linear, log, alone.tried, []) for log in references]
-        evidence = simulated(alone, logs, analyse(alone, logs))
+        logs = [log_rows(alone.model, log, alone.tried, ()) for log in references]
+        evidence = sized_by_simulation(alone, logs, analyse(alone, logs))
         answer = posterior(alone, logs, evidence)
-        changed, left_v = {}, {}
-        for name, of in evidence.items():
-            if of.fault not in OF_LOGS:
-                changed[name] = added(models[-1], of.shape.effect, of.shape.values(of.size))
-                left_v[name] = _rmse_v(changed[name], references)
+        changed = {
+            name: added(models[-1], of.shape.effect, of.shape.values(of.size))
+            for name, of in evidence.items()
+            if of.fault not in OF_LOGS
+        }
+        left_v = {name: _rmse_v(each, references) for name, each in changed.items()}
         # Of those that suffice the most probable, else of all. Two effects may cancel: without one
         # of them the error grows, until the other is found too.
         enough = [name for name, v in left_v.items() if v <= BEYOND * expected_v]
         effect = max(enough or left_v, key=answer.probabilities.__getitem__)
         models.append(changed[effect])
         errors_v.append(left_v[effect])
-        now = now.model_copy(update={"effects": effect_entries(models[-1].effects)})
         found.append(Missed(evidence[effect], answer, left_v[effect]))
     best = int(np.argmin(errors_v))
-    return ModelCheck(errors_v[0], among_v, expected_v, tuple(found[:best]), models[best])
+    return ModelCheck(errors_v[0], healthy.rmse_v, expected_v, tuple(found[:best]), models[best])
 
 
 def _expected_v(model: Model, healthy: Healthy) -> float:
     """Return the error of the references that the model's own uncertainty explains [V]."""
-    alone = of_model(model)
-    logs = [log_rows(alone.linear, log, (), []) for log in healthy.references]
-    plain = replace(alone, tried=(), known=alone.known.with_columns(range(alone.linear.p)))
+    alone = of_model(model, model.noise.voltage_rmse_v)
+    logs = [log_rows(alone.model, log, (), ()) for log in healthy.references]
+    coefficients = range(logs[0].columns.shape[1] - logs[0].m - 1)
+    plain = replace(alone, delta=alone.delta.with_columns(coefficients))
     open_v2 = float(np.mean([plain.open_v2([log]) for log in logs]))
     return float(np.sqrt(healthy.healthy_v2 + open_v2 + model.noise.level_std_v**2))
 
 
 def _rmse_v(model: ExtendedModel, references: Sequence[Trace]) -> float:
     """Return the RMS error of references by a model, each log weighing alike [V]."""
-    squares = [np.mean(Simulated(model, log).plain.residual_v ** 2) for log in references]
-    return float(np.sqrt(np.mean(squares)))
+    return rms(np.array([rms(Simulated(model, log).plain.residual_v) for log in references]))

@@ -7,13 +7,16 @@ One linear model of all logs about the given model:
 r [V] is the measured minus the modelled voltage. δ corrects the coefficients of the model (curve,
 temperature, resistances: the columns and the prior of the fit) and adds the effects of a pack in
 physical sizes. b_l ~ N(0, 1) are nuisance parameters: what one healthy log may differ by. c_k is
-the column of a shape of a fault, and a_k its size. A fault has one or more effects, and an effect
-one or more shapes. In a shape one amplitude of the effect is free, its other parameters are fixed.
+the column of a shape of a fault, and a_k its size.
 
 References, logs without a fault, give δ. Left out one at a time they give s², the error of a
 healthy log, and the excess o_k ≥ 1 by which their evidence of an effect exceeds chance. The noise
 is white and as large as all that left-out references show: a model error is a function of current
 and does not average out over thousands of rows.
+
+`Rows` (`model.gaussian`) are the square-root information array of such a model: whitened rows
+[X | r], made triangular by QR. Rows below each other add information, a prior is rows like any
+other, `eliminated` integrates the first unknowns out, and `posterior` solves for the rest.
 """
 
 from __future__ import annotations
@@ -26,24 +29,26 @@ from typing import Final
 import numpy as np
 
 from cangauge._typing import FloatArray, IntArray
-from cangauge.diagnosis.linear import Linear, N
+from cangauge.diagnosis.linear import (
+    N,
+    coefficient_columns,
+    corrected,
+    prior,
+    stated_covariance,
+    with_all_loads,
+)
 from cangauge.diagnosis.rows import Simulated, Trace, covered, without_outliers
-from cangauge.diagnosis.shapes import Shape, columns, shapes, steps
+from cangauge.diagnosis.shapes import Shape, shape_columns, shapes
+from cangauge.model.effects.base import Pack
+from cangauge.model.extended import ExtendedModel
 from cangauge.model.gaussian import Rows
 from cangauge.model.model_file import Model
 
 STRUCTURES: Final = (0.003, 0.009, 0.03, 0.09)
-"""Candidates for the standard deviation of a healthy pack's effects, relative to their bounds."""
+"""Candidates for the standard deviation of a healthy pack's effects, relative to their bounds. The
+pair with one of `CURVES` that predicts left-out references best is used."""
 CURVES: Final = (0.1, 0.3, 1.0)
-"""Candidates for the standard deviation of the curve about its level, relative to the prior's. The
-pair of candidates that predicts left-out references best is used."""
-
-UNSETTLED: Final = {150.0: 0.01, 1200.0: 0.01}
-"""Times over which a pack settles after the start of a log [s], and the part of the drop at 1 C by
-which its voltage then differs."""
-KNEE, KNEE_PCT = 0.0015, 4.0
-"""Usual error of the knee near empty, relative to the voltage, and the SoC over which it decays
-[%]."""
+"""Candidates for the standard deviation of the curve about its level, relative to the prior's."""
 
 LEAST_COVERED: Final = 0.2
 """A left-out reference with less of its rows at SoC that the others visit shows nothing."""
@@ -73,14 +78,11 @@ class LogRows:
     and the residual [V].
     """
 
-    trace: Trace
-    of: Simulated
+    simulated: Simulated
     m: int
     """Number of deviations."""
-    soc_pct: FloatArray
-    """Counted SoC of the rows that take part [%], shape (n,)."""
     kept: IntArray
-    """Those of them that count."""
+    """The rows that count, of those that take part."""
     columns: FloatArray
     """Of the rows that count, each times the root of its seconds."""
     rows: Rows
@@ -91,55 +93,64 @@ class LogRows:
     """Change of that counted one by each shape at its bound [%], shape (k,)."""
 
     @property
+    def trace(self) -> Trace:
+        """The log."""
+        return self.simulated.trace
+
+    @property
     def seconds(self) -> float:
         """Time that the rows stand for [s]."""
-        return float(self.trace.weights[self.kept].sum())
+        return self.trace.row_s * self.kept.size
 
 
 def log_rows(
-    linear: Linear, log: Trace, tried: Sequence[Shape], others: list[FloatArray]
+    model: ExtendedModel, log: Trace, tried: Sequence[Shape], visited: Sequence[FloatArray]
 ) -> LogRows:
-    """Return a log on the rows whose SoC others visit; on all if these are few."""
-    of = Simulated(linear.model, log)
+    """Return a log on the rows whose SoC other logs visited; on all if these are few."""
+    of = Simulated(model, log)
     soc, residual_v = of.plain.soc_pct[log.rows], of.plain.residual_v
-    near = covered(soc, others)
+    near = covered(soc, visited)
     if near.mean() < LEAST_COVERED:
         near[:] = True
-    kept = np.flatnonzero(near & without_outliers(residual_v, linear.pack.voltage_v))
-    by_shape = columns(of, tried)
-    deviations = np.column_stack(
-        [
-            *(
-                by_shape[:, k] * each.healthy_std
-                for k, each in enumerate(tried)
-                if each.healthy_std
-            ),
-            *_nuisance_columns(linear, log.log.time_s[log.rows] - log.log.time_s[0], soc),
-        ]
-    )
-    delta = np.column_stack([linear.columns(of), by_shape[:, _healthy_shapes(tried)]])
-    every = np.column_stack([deviations, delta, by_shape, residual_v])
-    table = every[kept] * np.sqrt(log.weights[kept])[:, None]
-    rows = Rows.of(table[:, :-1], table[:, -1], 1.0)
+    kept = np.flatnonzero(near & without_outliers(residual_v, model.pack.voltage_v))
+    by_shape = shape_columns(of, tried)
+    varying = [k for k, shape in enumerate(tried) if shape.healthy_std]
+    deviations = by_shape[:, varying] * [tried[k].healthy_std for k in varying]
+    beside = _nuisance_columns(model.pack, log.log.time_s[log.rows] - log.log.time_s[0], soc)
+    delta = np.column_stack([coefficient_columns(of), by_shape[:, _healthy_shapes(tried)]])
+    every = np.column_stack([deviations, beside, delta, by_shape, residual_v])
+    table = every[kept] * np.sqrt(log.row_s)
     change = log.own_change(of.plain.soc_pct)
-    counts = np.array([_count_by(shape, of, change) for shape in tried])
-    return LogRows(log, of, deviations.shape[1], soc, kept, table, rows, change, counts)
+    return LogRows(
+        of,
+        deviations.shape[1] + beside.shape[1],
+        kept,
+        table,
+        Rows.of(table[:, :-1], table[:, -1], 1.0),
+        change,
+        np.array([0.0 if change is None else _count_by(shape, of, change[1]) for shape in tried]),
+    )
 
 
-def _nuisance_columns(linear: Linear, time_s: FloatArray, soc_pct: FloatArray) -> list[FloatArray]:
-    """Return what healthy logs differ by besides effects [V]: an unsettled start, and the knee."""
-    drop_v = linear.pack.resistance_ohm * linear.pack.capacity_ah
-    unsettled = [part * drop_v * np.exp(-time_s / tau_s) for tau_s, part in UNSETTLED.items()]
-    knee = np.exp(-np.clip(soc_pct, -4.0, 100.0) / KNEE_PCT)
-    return [*unsettled, KNEE * linear.pack.voltage_v * knee]
+def _nuisance_columns(pack: Pack, time_s: FloatArray, soc_pct: FloatArray) -> FloatArray:
+    """Return what healthy logs differ by besides effects, at one σ [V], shape (m, 3).
+
+    A pack settles over 150 s and 1200 s after the start of a log: its voltage then differs by 1 %
+    of the drop at 1 C. Near empty the knee differs by 0.15 % of the voltage, less by e every 4 %.
+    """
+    drop_v = pack.resistance_ohm * pack.capacity_ah
+    unsettled = [0.01 * drop_v * np.exp(-time_s / tau_s) for tau_s in (150.0, 1200.0)]
+    knee = np.exp(-np.clip(soc_pct, -4.0, 100.0) / 4.0)
+    return np.column_stack([*unsettled, 0.0015 * pack.voltage_v * knee])
 
 
-def _count_by(shape: Shape, of: Simulated, plain: tuple[float, float] | None) -> float:
+def _count_by(shape: Shape, of: Simulated, counted_pct: float) -> float:
     """Return the change of the counted SoC by a shape at its bound [%]."""
-    if plain is None or not shape.changes_count:
+    if shape.effect.fault not in ("current_reading", "capacity"):
         return 0.0
-    now = of.of.own_change(of.with_effect(shape.effect, shape.values(shape.about)).soc_pct)
-    return 0.0 if now is None else (plain[1] - now[1]) * shape.bound / shape.about
+    changed = of.with_effect(shape.effect, shape.values(shape.about)).soc_pct
+    now = of.trace.own_change(changed)
+    return 0.0 if now is None else (counted_pct - now[1]) * shape.bound / shape.about
 
 
 def _healthy_shapes(tried: Sequence[Shape]) -> IntArray:
@@ -151,14 +162,15 @@ def _healthy_shapes(tried: Sequence[Shape]) -> IntArray:
 class Healthy:
     """What the healthy pack does, and how much healthy logs differ."""
 
-    linear: Linear
+    model: ExtendedModel
+    """The model that the references have corrected."""
     tried: tuple[Shape, ...]
-    known: Rows
-    """Rows of δ, the prior among them."""
+    delta: Rows
+    """What is known of δ, the prior included."""
     s2: float
     """Noise variance of one second [V²]."""
     references: tuple[Trace, ...] = ()
-    visited: list[FloatArray] = field(default_factory=list)
+    visited: tuple[FloatArray, ...] = ()
     """SoC of each reference [%]."""
     mean_squares_v2: tuple[float, ...] = ()
     """Of each left-out reference [V²]."""
@@ -188,13 +200,17 @@ class Healthy:
     @property
     def n(self) -> int:
         """Number of δ."""
-        return int(self.known.table.shape[1]) - 1
+        return int(self.delta.table.shape[1]) - 1
 
     def rows_of(self, log: LogRows) -> Rows:
         """Return a log's rows of δ and every shape, its own deviations integrated out."""
         rows = Rows(log.rows.table / np.sqrt(self.s2), 0.0)
         others = rows.table.shape[1] - 1 - log.m
         return (rows + Rows.prior(np.ones(log.m), others)).eliminated(log.m)
+
+    def delta_rows_of(self, log: LogRows) -> Rows:
+        """Return a log's rows of δ alone."""
+        return self.rows_of(log).with_columns(range(self.n))
 
     def square_v2(
         self, log: LogRows, delta: FloatArray, column: int = -1, size: float = 0.0
@@ -208,17 +224,17 @@ class Healthy:
 
     def gap_v2(self, logs: Sequence[LogRows]) -> float:
         """Return the mean square error of logs by the healthy pack's model [V²]."""
-        delta = self.known.posterior().mean
+        delta = self.delta.posterior().mean
         return sum(self.square_v2(log, delta) for log in logs) / total_s(logs)
 
     def open_v2(self, logs: Sequence[LogRows]) -> float:
         """Return the mean variance of the predicted voltage of logs by the covariance of δ [V²]."""
-        root = self.known.posterior().root
+        root = self.delta.posterior().root
         tables = [log.rows.table[:, log.m : log.m + self.n] for log in logs]
         return sum(float(np.sum((table @ root) ** 2)) for table in tables) / total_s(logs)
 
     def own_soc(self, log: LogRows, soc_pct: FloatArray) -> tuple[float, float]:
-        """Return the counted less the log's own change of SoC [σ], and this σ [%].
+        """Return the counted less the log's own change of SoC, in standard deviations; and one [%].
 
         The own change is scaled by `soc_ratio`. The difference is 0 where that without any effect
         does not stand out.
@@ -245,18 +261,18 @@ def total_s(logs: Sequence[LogRows]) -> float:
     return sum(log.seconds for log in logs)
 
 
-def of_model(model: Model, stated_v: float | None = None) -> Healthy:
-    """Return what the model alone states of a healthy pack; its error is `stated_v` by default."""
-    linear = Linear.of(model)
-    tried = _tried(linear)
-    mean, covariance = np.zeros(linear.p), linear.stated(model)
-    known = _prior_rows(mean, covariance, STRUCTURES[0], tried)
-    stated_v = model.noise.voltage_rmse_v if stated_v is None else stated_v
-    return Healthy(linear, tried, known, max(stated_v, LEAST_NOISE * linear.pack.voltage_v) ** 2)
+def total(delta: Rows, logs: Sequence[Rows]) -> Rows:
+    """Return the rows of δ with those of logs."""
+    return Rows(np.concatenate([delta.table, *(rows.table for rows in logs)]), 0.0).reduced()
 
 
-def _tried(linear: Linear) -> tuple[Shape, ...]:
-    return (*shapes(linear.pack), *steps(linear.pack))
+def of_model(given: Model, stated_v: float) -> Healthy:
+    """Return what the model alone states of a healthy pack, whose error is `stated_v` [V]."""
+    model = with_all_loads(given.extended_model())
+    tried = shapes(model.pack)
+    covariance = stated_covariance(model, given)
+    delta = _prior_rows(np.zeros(len(covariance)), covariance, STRUCTURES[0], tried)
+    return Healthy(model, tried, delta, max(stated_v, LEAST_NOISE * model.pack.voltage_v) ** 2)
 
 
 def _prior_rows(
@@ -273,79 +289,81 @@ def _prior_rows(
     return Rows(table, 0.0)
 
 
-def correct(model: Model, references: Sequence[Trace]) -> tuple[Healthy, list[LogRows], list[bool]]:
-    """Return the healthy pack, the rows of its references, and which of these can be judged.
+def corrected_by(
+    references: Sequence[Trace], given: Model
+) -> tuple[Healthy, list[LogRows], list[bool]]:
+    """Return the healthy pack by references, their rows, and which of them can be judged.
 
-    The model is corrected to the posterior mean of all references, with the prior of the fit.
-    `known` has the rows of the prior only: `learn` adds those of the references. A reference can be
-    left out and judged where the others visit enough of its SoC.
+    The model is corrected to the posterior mean of all references, with the prior of the fit. About
+    that model δ has its prior again. A reference can be left out and judged where the others visit
+    enough of its SoC.
     """
-    given = Linear.of(model)
-    first = [log_rows(given, log, (), []) for log in references]
-    seconds = np.array([log.seconds for log in first])
+    model = with_all_loads(given.extended_model())
+    logs = [log_rows(model, log, (), ()) for log in references]
+    visited = [log.simulated.plain.soc_pct[log.trace.rows] for log in logs]
+    seconds = np.array([log.seconds for log in logs])
     volts = [float(np.mean(log.log.voltage_v[log.rows])) for log in references]
-    mean_v = float(seconds @ volts) / float(seconds.sum())
-    mean_soc = float(seconds @ [log.soc_pct.mean() for log in first]) / float(seconds.sum())
-    prior = given.prior(model, mean_v, mean_soc)
-    least_v2 = (LEAST_NOISE * mean_v) ** 2
-    healthy = Healthy(given, (), _prior_rows(*prior, 1.0, ()), (FIRST_NOISE * mean_v) ** 2)
-    every = [len(first) > 1] * len(first)
-    for _ in range(2):
-        healthy = _tuned(healthy, first, every, prior, least_v2)
-    rows = total(healthy.known, [healthy.rows_of(log) for log in first])
-    linear = given.moved(rows.posterior().mean)
-    tried, visited = _tried(linear), [log.soc_pct for log in first]
-    logs, counts = [], []
-    for k, log in enumerate(references):
-        others = visited[:k] + visited[k + 1 :]
-        logs.append(log_rows(linear, log, tried, others))
-        counts.append(bool(others) and bool(covered(visited[k], others).mean() >= LEAST_COVERED))
-    prior = linear.prior(model, mean_v, mean_soc)
+    mean_v, mean_soc = (
+        float(seconds @ each) / float(seconds.sum())
+        for each in (volts, [soc.mean() for soc in visited])
+    )
+    known = prior(model, given, mean_v, mean_soc)
+    healthy = Healthy(model, (), _prior_rows(*known, 1.0, ()), (FIRST_NOISE * mean_v) ** 2)
+    healthy = _tuned(healthy, logs, [len(logs) > 1] * len(logs), known, mean_v)
+    rows = total(healthy.delta, [healthy.rows_of(log) for log in logs])
+    model = corrected(model, rows.posterior().mean)
+    tried, around = shapes(model.pack), [visited[:k] + visited[k + 1 :] for k in range(len(logs))]
+    logs = [
+        log_rows(model, log, tried, others) for log, others in zip(references, around, strict=True)
+    ]
+    is_judged = [
+        bool(others and covered(soc, others).mean() >= LEAST_COVERED)
+        for soc, others in zip(visited, around, strict=True)
+    ]
+    known = prior(model, given, mean_v, mean_soc)
     healthy = Healthy(
-        linear,
+        model,
         tried,
-        _prior_rows(*prior, 1.0, tried),
+        _prior_rows(*known, 1.0, tried),
         healthy.s2,
         tuple(references),
-        visited,
+        tuple(visited),
         soc_ratio=_soc_ratio(logs),
     )
-    for _ in range(2):
-        healthy = _tuned(healthy, logs, counts, prior, least_v2)
-    return healthy, logs, counts
-
-
-def total(known: Rows, logs: Sequence[Rows]) -> Rows:
-    """Return the rows of δ with those of logs."""
-    return Rows(np.concatenate([known.table, *(rows.table for rows in logs)]), 0.0).reduced()
+    return _tuned(healthy, logs, is_judged, known, mean_v), logs, is_judged
 
 
 def _tuned(
     healthy: Healthy,
     logs: Sequence[LogRows],
-    counts: Sequence[bool],
-    prior: tuple[FloatArray, FloatArray],
-    least_v2: float,
+    is_judged: Sequence[bool],
+    known: tuple[FloatArray, FloatArray],
+    mean_v: float,
 ) -> Healthy:
-    """Return the healthy pack with the prior and noise that predict left-out references best."""
-    every = [_gram(healthy.rows_of(log).with_columns(range(healthy.n))) for log in logs]
-    whole = np.sum(every, axis=0)
-    judged = [k for k, is_judged in enumerate(counts) if is_judged]
-    best, found = np.inf, healthy
-    for curve, structure in itertools.product(CURVES, STRUCTURES):
-        mean, covariance = prior
-        known = _prior_rows(mean, _flatter(covariance, curve), structure, healthy.tried)
-        others = _gram(known) + whole
-        left = []
-        for k in judged:
-            without = others - every[k]
-            delta = np.linalg.solve(without[:-1, :-1], without[:-1, -1])
-            left.append(healthy.square_v2(logs[k], delta) / logs[k].seconds)
-        loss = float(np.sum(np.log(np.add(left, least_v2)))) if left else 0.0
-        if loss < best:
-            noise_v2 = float(np.mean(left)) if left else healthy.s2
-            best, found = loss, replace(healthy, known=known, s2=max(noise_v2, least_v2))
-    return found
+    """Return the healthy pack with the prior and noise that predict left-out references best.
+
+    Twice, since the weight of the rows follows from the noise. `known` is the prior's mean and
+    covariance, before it is tuned.
+    """
+    mean, covariance = known
+    least_v2 = (LEAST_NOISE * mean_v) ** 2
+    judged = [k for k, each in enumerate(is_judged) if each]
+    for _ in range(2):
+        every = [_gram(healthy.delta_rows_of(log)) for log in logs]
+        whole = np.sum(every, axis=0)
+        found: list[tuple[float, int, Rows, float]] = []
+        for curve, structure in itertools.product(CURVES, STRUCTURES):
+            rows = _prior_rows(mean, _flatter(covariance, curve), structure, healthy.tried)
+            with_all, left = _gram(rows) + whole, []
+            for k in judged:
+                others = with_all - every[k]
+                delta = np.linalg.solve(others[:-1, :-1], others[:-1, -1])
+                left.append(healthy.square_v2(logs[k], delta) / logs[k].seconds)
+            loss = float(np.sum(np.log(np.add(left, least_v2))))
+            found.append((loss, len(found), rows, float(np.mean(left or healthy.s2))))
+        _, _, rows, noise_v2 = min(found)
+        healthy = replace(healthy, delta=rows, s2=max(noise_v2, least_v2))
+    return healthy
 
 
 def _gram(rows: Rows) -> FloatArray:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -12,18 +12,13 @@ from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.identify.rows import dequantize, usable_rows
 from cangauge.logs.gaps import usual_step_s
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.effects.base import Effect, Signals, Values
-from cangauge.model.effects.library import shape_key
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.voltage_model import DELAYS_S
 
 STEP_S, MOST_SECONDS = 0.9, 60.0
 """Logs with a shorter step are averaged over seconds; a logger of 1 Hz jitters. A row stands for at
 most the latter time, as in a fit [s]."""
-
-LEAST_ROWS: Final = 60
-"""A log with fewer rows after the delay line has filled is used as a whole."""
 
 COVER_PCT: Final = 2.0
 """Logs cover SoC this far beyond their own [%]."""
@@ -49,6 +44,8 @@ class Trace:
         Assumed SoC before the first row [%].
     rows : array of int, shape (m,)
         Rows of `log` that take part, as in a fit.
+    row_s : float
+        Time that each of them stands for [s].
     """
 
     log: Log
@@ -56,28 +53,7 @@ class Trace:
     second: IntArray
     start_pct: float
     rows: IntArray
-
-    @property
-    def name(self) -> str:
-        """Name of the log."""
-        return self.log.name
-
-    @cached_property
-    def weights(self) -> FloatArray:
-        """Time that each row of `rows` stands for [s], shape (m,)."""
-        step_s = usual_step_s(self.log.time_s)
-        return np.full(self.rows.size, min(max(step_s, 1.0), MOST_SECONDS))
-
-    def has_gap(self, longest_s: float) -> bool:
-        """Whether a step between rows is longer [s]."""
-        return bool(np.any(np.diff(self.original.time_s) > longest_s))
-
-    def means(self, signals: Signals) -> Signals:
-        """Return signals at the log's own rate as means over the rows of `log`."""
-        if self.second.size == len(self.log):
-            return signals
-        counts = np.bincount(self.second)
-        return Signals(*(np.bincount(self.second, weights=each) / counts for each in signals))
+    row_s: float
 
     def own_change(self, soc_pct: FloatArray) -> tuple[float, float] | None:
         """Return the change of the log's own SoC, and that of a counted one over the same time [%].
@@ -91,36 +67,25 @@ class Trace:
         return float(own[last] - own[first]), float(soc_pct[last] - soc_pct[first])
 
 
-def trace(log: Log, capacity_ah: float, start_pct: float | None = None) -> Trace:
-    """Return a log at 1 Hz.
-
-    Its start is `start_pct`, or counted from its first known SoC back to the first row.
-    """
-    if start_pct is None:
-        start_pct = soc_at_first_row(log, capacity_ah)
-    if start_pct is None:
-        raise ValueError("unknown SoC at the start")
+def trace(log: Log, start_pct: float) -> Trace:
+    """Return a log at 1 Hz that starts at a SoC [%]."""
     log = dequantize(log)
-    original = Signals.of(log)
-    second = np.arange(len(log))
+    original, second = Signals.of(log), np.arange(len(log))
     if usual_step_s(log.time_s) < STEP_S:
         tick = np.floor(log.time_s - log.time_s[0] + 1e-6)
-        first, second = np.unique(tick, return_index=True, return_inverse=True)[1:]
-        counts = np.bincount(second)
-        means = [np.bincount(second, weights=each) / counts for each in original]
+        _, first, second = np.unique(tick, return_index=True, return_inverse=True)
         soc = None if log.soc_pct is None else log.soc_pct[first]
-        log = replace(
-            log,
-            time_s=means[0],
-            current_a=means[1],
-            voltage_v=means[2],
-            temperature_c=means[3],
-            soc_pct=soc,
-        )
+        log = replace(log, **_means(original, second)._asdict(), soc_pct=soc)
     rows, _ = usable_rows(log, DELAYS_S, 1.0)
-    if rows.size < LEAST_ROWS:
+    if not rows.size:
         rows = np.arange(len(log))
-    return Trace(log, original, second, start_pct, rows)
+    row_s = min(max(usual_step_s(log.time_s), 1.0), MOST_SECONDS)
+    return Trace(log, original, second, start_pct, rows, row_s)
+
+
+def _means(signals: Signals, second: IntArray) -> Signals:
+    counts = np.bincount(second)
+    return Signals(*(np.bincount(second, weights=each) / counts for each in signals))
 
 
 class Simulated:
@@ -129,51 +94,46 @@ class Simulated:
     Parameters
     ----------
     model : ExtendedModel
-    of : Trace
+    trace : Trace
     """
 
-    def __init__(self, model: ExtendedModel, of: Trace) -> None:
-        self.model, self.of = model, of
-        self.signals = Signals.of(of.log)
-        every = slice(None)
-        self._currents = model.model.currents(of.log.time_s, of.log.current_a, every)
-        self.plain = self._predict(model, self.signals)
+    def __init__(self, model: ExtendedModel, trace: Trace) -> None:
+        self.model, self.trace = model, trace
+        self.signals = Signals.of(trace.log)
+        self.currents_a = model.model.currents(trace.log.time_s, trace.log.current_a, slice(None))
+        self.plain = self._predict(model, self.signals, self.currents_a)
 
-    def _predict(self, model: ExtendedModel, signals: Signals) -> Prediction:
-        kept = signals.current_a is self.signals.current_a
-        return model.predict(
-            signals,
-            self.of.start_pct,
-            self.of.rows,
-            currents_a=self._currents if kept else None,
-        )
+    def _predict(
+        self, model: ExtendedModel, signals: Signals, currents_a: FloatArray | None = None
+    ) -> Prediction:
+        at = self.trace
+        return model.predict(signals, at.start_pct, at.rows, currents_a=currents_a)
 
     def with_effect(self, effect: Effect, values: Values) -> Prediction:
         """Return the prediction by the model with one more effect."""
-        if effect.moves_time:
-            context = effect.context(values, self.model.model, self.model.pack)
-            moved = effect.correct(self.of.original, values, context._replace(is_whole=True))
-            return self._predict(self.model, self.of.means(moved))
-        return self._predict(added(self.model, effect, values), self.signals)
+        if not effect.moves_time:
+            return self._predict(added(self.model, effect, values), self.signals, self.currents_a)
+        context = effect.context(values, self.model.model, self.model.pack)
+        moved = effect.correct(self.trace.original, values, context._replace(is_whole=True))
+        return self._predict(self.model, _means(moved, self.trace.second))
 
 
 def added(model: ExtendedModel, effect: Effect, values: Values) -> ExtendedModel:
     """Return a model with an effect, added to one of the same shape."""
-    key, neutral = shape_key(effect, values), effect.neutral(model.pack)
-    if not effect.amplitudes:  # the amplitude of a skew is its shape
-        key = (effect.id,)
-    same = [item for item in model.effects if (shape_key(*item) == key or key == (item[0].id,))]
-    names = [item.name for item in effect.amplitudes or effect.parameters[:1]]
-    total = dict(values)
-    for _, known in same:
-        for name in names:
+    # The one parameter of a skew is amplitude and shape.
+    amplitudes = [item.name for item in effect.amplitudes or effect.parameters[:1]]
+    fixed = values.keys() - amplitudes
+    neutral, total, others = effect.neutral(model.pack), dict(values), []
+    for other, known in model.effects:
+        if other.id != effect.id or any(known[name] != values[name] for name in fixed):
+            others.append((other, known))
+            continue
+        for name in amplitudes:
             total[name] += known[name] - neutral[name]
-    others = tuple(item for item in model.effects if item not in same)
-    clipped = effect.clipped(total, model.pack) if effect.amplitudes else total
-    return replace(model, effects=(*others, (effect, clipped)))
+    return replace(model, effects=(*others, (effect, effect.clipped(total, model.pack))))
 
 
-def covered(soc_pct: FloatArray, others: list[FloatArray]) -> BoolArray:
+def covered(soc_pct: FloatArray, others: Sequence[FloatArray]) -> BoolArray:
     """Return where a SoC [%] lies within those that others visit; everywhere without others."""
     result = np.full(soc_pct.size, not others)
     for other in others:

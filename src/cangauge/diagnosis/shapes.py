@@ -1,7 +1,9 @@
 """Shapes of the faults: every effect of the model library as columns of a linear model.
 
-A shape is one amplitude of an effect with one trial value of each of its other parameters. Its
-column is the change of the residual by it, in units of the amplitude's larger bound.
+A *fault* is what an engineer would repair, such as the voltage reading. It shows as one of several
+*effects* of the model library, such as an offset or a gain. An effect has one or more *shapes*: in
+each, one amplitude is free and every other parameter has one trial value. The column of a shape is
+the change of the residual by it, in units of the amplitude's larger bound.
 """
 
 from __future__ import annotations
@@ -31,11 +33,12 @@ zero is blind."""
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One amplitude of an effect, its other parameters fixed.
+    """One amplitude of an effect of a fault, its other parameters fixed.
 
     Parameters
     ----------
     effect : Effect
+        Its `fault` is the fault.
     name : str
         Of the amplitude.
     fixed : dict of str to float
@@ -46,8 +49,10 @@ class Shape:
         Bounds of the amplitude relative to `neutral`.
     about : float
         Size of the finite difference.
+    usual : float
+        Standard deviation of the amplitude between healthy logs.
     place : float, optional
-        Of a step of resistance: the part of a log at which it happens.
+        Of a step of resistance: the part of a log at which it happens; 0 is before its first row.
     """
 
     effect: Effect
@@ -57,9 +62,8 @@ class Shape:
     low: float
     high: float
     about: float
-    place: float | None = None
     usual: float = 0.0
-    """Standard deviation between healthy logs."""
+    place: float | None = None
 
     @property
     def bound(self) -> float:
@@ -76,16 +80,6 @@ class Shape:
         return {**self.fixed, self.name: self.neutral + size}
 
     @property
-    def is_tangent(self) -> bool:
-        """Whether the column is a derivative at neutral, and no secant."""
-        return abs(self.about) < 0.1 * self.bound
-
-    @property
-    def changes_count(self) -> bool:
-        """Whether it changes how charge is counted beyond the start."""
-        return self.effect.fault in ("current_reading", "capacity")
-
-    @property
     def is_of_pack(self) -> bool:
         """Whether a healthy pack has some of it: a mechanism that the equation may lack."""
         added = self.effect.adds_voltage and self.effect.id not in (STEP_ID, GROWTH_ID)
@@ -98,44 +92,17 @@ class Shape:
             return 0.0
         return self.usual / self.bound
 
-    def at(self, part: float, duration_s: float) -> Shape:
-        """Return a step of resistance at a part of a log."""
-        return replace(self, fixed={**self.fixed, "start_s": part * duration_s}, place=part)
+    def in_log(self, duration_s: float) -> Shape:
+        """Return the shape in a log of a duration: a step of resistance has its time there."""
+        if self.place is None:
+            return self
+        return replace(self, fixed={**self.fixed, "start_s": self.place * duration_s})
 
 
-def _shapes_of(item: EffectCandidate, pack: Pack) -> list[Shape]:
-    shapes = []
-    usual = {each.name: each.healthy_std * each.factor(pack) for each in item.effect.parameters}
-    if item.shape.get("delayed") == 0.0:
-        usual = {}
-    for k, name in enumerate(item.amplitudes):
-        neutral = dict(zip(item.amplitudes, item.neutral.tolist(), strict=True))
-        low, high = item.bounds[k].tolist()
-        one = Shape(
-            item.effect,
-            name,
-            {**neutral, **item.shape},
-            neutral[name],
-            low,
-            high,
-            float(item.steps[k]),
-            usual=usual.get(name, 0.0),
-        )
-        shapes.append(one)
-    if item.effect.moves_time:
-        whole = shapes[0]
-        for about in SECANTS_S:
-            low, high = sorted((0.0, 1.5 * about))
-            shapes.append(replace(whole, low=low, high=high, about=about))
-    return shapes
-
-
-def shapes(pack: Pack) -> list[Shape]:
-    """Return every shape of every effect; steps of resistance are added by `steps`."""
+def shapes(pack: Pack) -> tuple[Shape, ...]:
+    """Return every shape of every effect, a step of resistance at each place of a log last."""
     found = []
     for effect in LIBRARY.values():
-        if effect.id == STEP_ID:
-            continue
         grids = {item.name: item.trials(pack) for item in effect.shapes if effect.amplitudes}
         # A switch refines a shape that has a grid; its first value is tried.
         first = {
@@ -144,30 +111,42 @@ def shapes(pack: Pack) -> list[Shape]:
         for item in candidates([effect], pack):
             if all(item.shape.get(name) == value for name, value in first.items()):
                 found += _shapes_of(item, pack)
+    steps = [shape for shape in found if shape.effect.id == STEP_ID]
+    others = [shape for shape in found if shape.effect.id != STEP_ID]
+    return (*others, *(replace(step, place=part) for step in steps for part in PLACES))
+
+
+def _shapes_of(item: EffectCandidate, pack: Pack) -> list[Shape]:
+    """Return the shapes of an effect with one trial value of each other parameter."""
+    effect, neutral = item.effect, dict(zip(item.amplitudes, item.neutral.tolist(), strict=True))
+    usual = {each.name: each.healthy_std * each.factor(pack) for each in effect.parameters}
+    if item.shape.get("delayed") == 0.0:
+        usual = dict.fromkeys(usual, 0.0)
+    fixed = {**neutral, **item.shape}
+    sizes = zip(item.amplitudes, item.bounds.tolist(), item.steps.tolist(), strict=True)
+    found = [
+        Shape(effect, name, fixed, neutral[name], low, high, step, usual[name])
+        for name, (low, high), step in sizes
+    ]
+    if effect.moves_time:
+        for about in SECANTS_S:
+            low, high = sorted((0.0, 1.5 * about))
+            found.append(replace(found[0], low=low, high=high, about=about))
     return found
 
 
-def steps(pack: Pack) -> list[Shape]:
-    """Return a step of resistance at each place of a log."""
-    (item,) = candidates([LIBRARY[STEP_ID]], pack)
-    (one,) = _shapes_of(item, pack)
-    return [replace(one, place=part) for part in PLACES]
-
-
-def columns(of: Simulated, tried: Sequence[Shape]) -> FloatArray:
+def shape_columns(of: Simulated, tried: Sequence[Shape]) -> FloatArray:
     """Return the change of voltage by each shape at its bound [V], shape (m, k)."""
-    plain, model = of.plain, of.model
-    rows = of.of.rows
+    plain, model, rows = of.plain, of.model, of.trace.rows
     true = plain.signals
-    currents = of.model.model.currents(true.time_s, true.current_a, slice(None))
+    currents = model.model.currents(true.time_s, true.current_a, slice(None))
     table = model.model.load_columns(true.temperature_c, currents)
     drop_v = table[:, 1:] @ model.model.load_coefficients[1:]
     load = Load(true.time_s, true.current_a, true.temperature_c, drop_v)
     soc = plain.soc_pct[rows]
     found = np.empty((rows.size, len(tried)))
-    duration_s = of.of.log.duration_s
     for k, each in enumerate(tried):
-        shape = each if each.place is None else each.at(each.place, duration_s)
+        shape = each.in_log(of.trace.log.duration_s)
         effect, values = shape.effect, shape.values(shape.about)
         if effect.adds_voltage:
             changed = effect.added_v(load, rows, soc, values, model)

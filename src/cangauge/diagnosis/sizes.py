@@ -24,10 +24,6 @@ evidence: beyond a bend of the curve, a column at zero misjudges them."""
 MOVE_SOC: Final = ("start", "capacity", "current_reading")
 """Faults that move the SoC: their effects are simulated always."""
 
-START_PARTS: Final = (0.5, 1.0)
-"""Parts of its bounds from which a wrong start is simulated: it moves all rows at once, beyond a
-bend of the curve."""
-
 FOLDS, BLOCK_S = 4, 240.0
 """Interleaved blocks of a log that are held out in turn, and their length [s]: longer than the
 correlation of the errors."""
@@ -35,6 +31,8 @@ correlation of the errors."""
 
 class SizeProfile:
     """Likelihood of the size of one effect in some logs, δ and the logs' deviations integrated out.
+
+    Sizes are in units of the larger bound of the effect's shape.
 
     Parameters
     ----------
@@ -47,40 +45,42 @@ class SizeProfile:
     def __init__(
         self, healthy: Healthy, logs: Sequence[LogRows], inside: Sequence[BoolArray]
     ) -> None:
-        self._healthy, self._logs, self._inside = healthy, logs, inside
-        self._numbers = [k for k, rows in enumerate(inside) if rows.any()]
-        n, known = healthy.n, healthy.known.table
-        size = n + sum(logs[k].m for k in self._numbers)
-        precision = np.eye(size)
+        self._healthy, self._logs = healthy, logs
+        n, known = healthy.n, healthy.delta.table
+        used = [k for k, rows in enumerate(inside) if rows.any()]
+        size = n + sum(logs[k].m for k in used)
+        precision, self._right = np.eye(size), np.zeros((size, 2))
         precision[:n, :n] = known[:, :-1].T @ known[:, :-1]
-        self._right = np.zeros((size, 2))
         self._right[:n, 1] = known[:, :-1].T @ known[:, -1]
-        self._X, self._at, first = {}, {}, n
-        for k in self._numbers:
+        self._parts, first = [], n
+        for k in used:
             m = logs[k].m
             X = logs[k].columns[inside[k], : m + n] / np.sqrt(healthy.s2)
             at = np.r_[first : first + m, :n]
             precision[np.ix_(at, at)] += X.T @ X
-            self._X[k], self._at[k], first = X, at, first + m
+            self._parts.append((k, inside[k], X, at))
+            first += m
         self._root = np.linalg.cholesky(precision)
 
     def about(self, evidence: Evidence, size: float) -> tuple[float, float, float, float]:
-        """Return χ² about a size [bounds], its gradient and curvature, and the error left [V²]."""
-        products, right, volts = np.zeros((2, 2)), self._right.copy(), {}
-        for k in self._numbers:
-            log, rows = self._logs[k], self._inside[k]
-            vectors, row = self._residuals(evidence.shape_in(k, log), log, size)
-            weight = np.sqrt(log.trace.weights[log.kept][rows] / self._healthy.s2)
-            v = vectors[rows] * weight[:, None]
-            products += v.T @ v + np.outer(row, row)
-            right[self._at[k]] += self._X[k].T @ v
-            volts[k] = v[:, 1]
+        """Return χ² about a size, its gradient and curvature, and the error that is left [V²]."""
+        products, right, residuals = np.zeros((2, 2)), self._right.copy(), []
+        for k, rows, X, at in self._parts:
+            log = self._logs[k]
+            vectors, soc = self._residuals(evidence.shapes[k], log, size)
+            v = vectors[rows] * np.sqrt(log.trace.row_s / self._healthy.s2)
+            products += v.T @ v + np.outer(soc, soc)
+            right[at] += X.T @ v
+            residuals.append(v[:, 1])
         half = np.linalg.solve(self._root, right)
         left = products - half.T @ half
         n = self._healthy.n
         delta = np.linalg.solve(self._root.T, half[:, 1])[:n]
-        square = sum(float(np.sum((v - self._X[k][:, -n:] @ delta) ** 2)) for k, v in volts.items())
-        left_v2 = square * self._healthy.s2 / total_s([self._logs[k] for k in self._numbers])
+        square = sum(
+            float(np.sum((v - X[:, -n:] @ delta) ** 2))
+            for v, (_, _, X, _) in zip(residuals, self._parts, strict=True)
+        )
+        left_v2 = square * self._healthy.s2 / total_s([self._logs[k] for k, *_ in self._parts])
         return float(left[1, 1]), float(left[0, 1]), max(float(left[0, 0]), 1e-9), left_v2
 
     def _residuals(
@@ -88,35 +88,42 @@ class SizeProfile:
     ) -> tuple[FloatArray, FloatArray]:
         """Return slope and residual about a size on the rows kept, and the same of the own SoC.
 
-        The slope is per bound, with the sign of a column.
+        The slope has the sign of a column.
         """
-        plain = log.of.plain
-        if shape is None:
-            residual_v = plain.residual_v[log.kept]
-            row, _ = self._healthy.own_soc(log, plain.soc_pct)
-            return np.column_stack([np.zeros_like(residual_v), residual_v]), np.array([0.0, row])
-        step = abs(shape.about) / shape.bound
-        low, high = shape.low / shape.bound, shape.high / shape.bound
-        beyond = size + step if size + step <= high else size - step
-        beyond = min(max(beyond, low), high)
-        found = [
-            log.of.with_effect(shape.effect, shape.values(each * shape.bound)) if each else plain
-            for each in (size, beyond)
-        ]
-        here, there = (each.residual_v[log.kept] for each in found)
-        rows = [self._healthy.own_soc(log, each.soc_pct)[0] for each in found]
-        change = beyond - size
-        slope = np.column_stack([(here - there) / change, here])
-        return slope, np.array([(rows[0] - rows[1]) / change, rows[0]])
+        here = there = log.simulated.plain
+        change = 1.0
+        if shape is not None:
+            step = abs(shape.about) / shape.bound
+            low, high = shape.low / shape.bound, shape.high / shape.bound
+            beyond = size + step if size + step <= high else size - step
+            beyond = min(max(beyond, low), high)
+            change = beyond - size
+            here, there = (
+                log.simulated.with_effect(shape.effect, shape.values(each * shape.bound))
+                if each
+                else log.simulated.plain
+                for each in (size, beyond)
+            )
+        volts, volts_there = here.residual_v[log.kept], there.residual_v[log.kept]
+        soc, soc_there = (self._healthy.own_soc(log, each.soc_pct)[0] for each in (here, there))
+        slope = np.column_stack([(volts - volts_there) / change, volts])
+        return slope, np.array([(soc - soc_there) / change, soc])
 
-    def newton(self, evidence: Evidence, size: float) -> float:
-        """Return the size after one step from a size found with all rows [bounds]."""
-        _, gradient, curvature, _ = self.about(evidence, size)
+    def _next(
+        self, evidence: Evidence, size: float, here: tuple[float, float, float, float]
+    ) -> float:
+        """Return the size after a Gauss–Newton step from what `about` returned of one."""
+        _, gradient, curvature, _ = here
         change = (gradient - RIDGE * size) / (curvature + RIDGE)
         return float(np.clip(size + change, *evidence.bounds))
 
+    def sized(self, evidence: Evidence) -> float:
+        """Return the size by these rows [unit of the shape], a step from that of the evidence."""
+        size = evidence.size / evidence.shape.bound
+        return self._next(evidence, size, self.about(evidence, size)) * evidence.shape.bound
+
     def largest(self, evidence: Evidence, starts: Sequence[float]) -> Evidence:
-        """Return the evidence at the most probable size, from the best of several starts [bounds].
+        """Return the evidence at the most probable size, from the best of several starts.
 
         A size of zero has no evidence.
         """
@@ -132,8 +139,7 @@ class SizeProfile:
                 step *= SHRINK
                 continue
             size, here = size + step, there
-            change = (here[1] - RIDGE * size) / (here[2] + RIDGE)
-            step = float(np.clip(size + change, *evidence.bounds)) - size
+            step = self._next(evidence, size, here) - size
             if abs(step) < MIN_CHANGE * abs(size):
                 break
         chi2, _, curvature, left_v2 = here
@@ -147,7 +153,7 @@ class SizeProfile:
         )
 
 
-def simulated(
+def sized_by_simulation(
     healthy: Healthy, logs: Sequence[LogRows], evidence: dict[str, Evidence]
 ) -> dict[str, Evidence]:
     """Return the evidence with effects on signals and count simulated at their sizes."""
@@ -155,14 +161,14 @@ def simulated(
     profile, found = SizeProfile(healthy, logs, _every(logs)), dict(evidence)
     for name, e in evidence.items():
         is_likely = nats[name] > SIMULATED_PART * max(nats.values())
-        if e.shape.effect.adds_voltage or not (is_likely or e.fault in MOVE_SOC):
+        shape = e.shape
+        if shape.effect.adds_voltage or not (is_likely or e.fault in MOVE_SOC):
             continue
-        bound = e.shape.bound
-        starts = [e.size / bound]
-        if e.fault == "start":
-            starts += [part * end for end in e.bounds for part in START_PARTS]
-        if e.shape.effect.moves_time and not e.shape.is_tangent:
-            starts.append(e.shape.about / bound)
+        starts = [e.size / shape.bound]
+        if e.fault == "start":  # it moves all rows at once, beyond a bend of the curve
+            starts += [part * end for end in e.bounds for part in (0.5, 1.0)]
+        if shape.effect.moves_time and 0.0 in (shape.low, shape.high):  # a secant
+            starts.append(shape.about / shape.bound)
         found[name] = profile.largest(e, starts)
     return found
 
@@ -171,10 +177,8 @@ def _every(logs: Sequence[LogRows]) -> list[BoolArray]:
     return [np.ones(log.kept.size, dtype=bool) for log in logs]
 
 
-def held_out(
-    healthy: Healthy, logs: Sequence[LogRows]
-) -> list[tuple[SizeProfile, list[BoolArray]]]:
-    """Return the rows that are judged together, with the profile of sizes without them.
+def folds(healthy: Healthy, logs: Sequence[LogRows]) -> list[tuple[SizeProfile, list[BoolArray]]]:
+    """Return sets of rows that are judged together, each with the profile of sizes without them.
 
     One log of several in turn; of a single log, one set of blocks.
     """

@@ -147,7 +147,7 @@ def _corrected(found: Diagnosis) -> str:
         return "the model"
     what = "this"
     if len(found.posterior.stated) > 1:
-        what = f"the {FAULT[found.correction.fault].title}"
+        what = f"the {FAULT[found.correction.evidence.fault].title}"
     return f"the model and {what}" if found.lacks else what
 
 
@@ -156,7 +156,7 @@ def _other(found: Diagnosis) -> str:
     return "".join(
         f" ({volts(found.corrections[fault].rmse_v)} with the {FAULT[fault].title})"
         for fault in found.posterior.stated
-        if found.correction is not None and fault != found.correction.fault
+        if found.correction is not None and fault != found.correction.evidence.fault
     )
 
 
@@ -206,7 +206,7 @@ def caveats(found: Diagnosis) -> list[str]:
         if log.duration_s < SHORT_S:
             minutes = number(log.duration_s / 60.0, 0, "min")
             remarks.append(f"{log.name} lasts {minutes}: slow effects hardly develop in it.")
-        if rows.trace.has_gap(bridge_s(log.time_s)):
+        if np.diff(log.time_s).max() > bridge_s(log.time_s):
             remarks.append(f"{log.name} has gaps; charge that flowed in them is not counted.")
     remarks.append("A fault is a signature at the terminals, not proof of a mechanism.")
     return remarks

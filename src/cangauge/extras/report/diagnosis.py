@@ -11,7 +11,7 @@ from cangauge._text import number, span
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.faults import FAULT
 from cangauge.diagnosis.text import fault_rows, percent, plan_text
-from cangauge.diagnosis.where import stands_out
+from cangauge.diagnosis.where import stands_out, surely
 from cangauge.extras.report.charts import (
     BLUE,
     GREEN,
@@ -100,9 +100,10 @@ def _places(where: Sequence[Mapping[str, Any]]) -> list[Figure]:
             caption = f"At {_interval(largest)} it is {times} times that of all rows."
         title = f"Where: {_AXES[axis]}"
         figures[axis] = bars(title, "RMS error of the model", entries, caption, unit="V")
-    surest = sorted(where, key=lambda place: place["ci"][0], reverse=True)
-    first = [figures.pop(place["axis"]) for place in surest[:1]]
-    return [*first, *figures.values()]
+    if not where:
+        return []
+    first = figures.pop(max(where, key=surely)["axis"])
+    return [first, *figures.values()]
 
 
 def _interval(place: Mapping[str, Any]) -> str:
@@ -114,9 +115,9 @@ def _interval(place: Mapping[str, Any]) -> str:
 
 def _over_time(found: Diagnosis) -> list[Figure]:
     """Return the figures of the errors, before and after, and of the current."""
-    errors = found.log_errors
+    errors = found.errors.by_log
     axis = [log.time_s - log.time_s[0] for log in found.logs]
-    time = TimeFigures(axis, [log.name for log in errors])
+    time = TimeFigures(axis, [log.name for log in found.logs])
     error = time.figure(
         "Measured minus modelled voltage",
         "measured − model [V]",
