@@ -286,6 +286,18 @@ def test_of_two_stated_faults_the_likelier_corrects(
     assert f"with the {words[other]})" in both.summary
 
 
+def test_a_second_fault_is_named_only_where_both_are_sure(faulty: Diagnosis) -> None:
+    both = judged(faulty, voltage_offset=0.7, capacity=0.25, weak_cell=0.05)
+    assert ", or the capacity is" in both.summary
+    assert "Most likely" not in both.summary
+    apart = judged(faulty, voltage_offset=0.7, capacity=0.1, weak_cell=0.1, time_skew=0.1)
+    assert apart.summary.startswith("Most likely the pack voltage reads")
+    assert "or the capacity is" not in apart.summary
+    assert apart.to_json()["answer"]["stated"] == ["voltage_reading", "capacity"]
+    alone = judged(faulty, voltage_offset=0.95, capacity=0.05)
+    assert alone.summary.startswith("The pack voltage reads")
+
+
 def test_faults_that_look_alike_are_told_together(faulty: Diagnosis) -> None:
     both = judged(faulty, voltage_offset=0.5, initial_soc=0.4, weak_cell=0.1).summary
     assert "the level of the voltage (voltage reading, wrong start or slow voltage) 90 %." in both

@@ -76,7 +76,7 @@ def _fault(found: Diagnosis, fault: str) -> dict[str, Any]:
     best, correction = found.best_of(fault), found.corrections[fault]
     size, unit = found.visible_from(best.shape.effect.id)
     return _effect(best, found.posterior) | {
-        "title": FAULT[fault].title,
+        "title": FAULT[fault]["title"],
         "rmse_v": correction.rmse_v,
         "closed_fraction": closed_part(correction.errors, found.healthy.healthy_v2)[0],
         "visible_from": {"size": size, "unit": unit},
@@ -104,7 +104,7 @@ def _step(found: Diagnosis) -> dict[str, Any] | None:
     fault, before, after = found.next_step
     first, second = (*found.posterior.stated, None)[:2]
     return {
-        "measurement": FAULT[fault].measurement,
+        "measurement": FAULT[fault]["measurement"],
         "between": [first, second],
         "probability_now": before,
         "probability_after": after,

@@ -244,7 +244,7 @@ class Diagnosis:
     def check_first(self) -> str:
         """What to do first, in a sentence."""
         if self.next_step is not None:
-            return FAULT[self.next_step[0]].instruction
+            return str(FAULT[self.next_step[0]]["instruction"])
         if self.posterior.level == "none":
             if self.posterior.leans_to_fault:
                 return "Nothing to repair yet: diagnose one more log like these with them."

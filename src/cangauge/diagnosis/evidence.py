@@ -81,16 +81,21 @@ class Evidence:
         return self.shape.effect.fault
 
     @property
+    def half_width(self) -> float:
+        """Half of the 95 % interval of the size [unit of the shape]."""
+        return TWO_SIDED * float(np.hypot(self.std, SHAPE_STD * self.size))
+
+    @property
     def parameters(self) -> dict[str, Quantity]:
         """Parameters of the effect, with the 95 % interval of its amplitude."""
-        half = TWO_SIDED * float(np.hypot(self.std, SHAPE_STD * self.size))
-        shape, found = self.shape, {}
+        shape, half = self.shape, self.half_width
         values = shape.values(self.size)
-        for item in shape.effect.parameters:
-            value = values[item.name]
-            ci = (value - half, value + half) if item.name == shape.name else None
-            found[item.name] = Quantity(value, ci, item.unit)
-        return found
+        of = values[shape.name]
+        found = {
+            item.name: Quantity(values[item.name], None, item.unit)
+            for item in shape.effect.parameters
+        }
+        return found | {shape.name: Quantity(of, (of - half, of + half), shape.unit)}
 
 
 def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:

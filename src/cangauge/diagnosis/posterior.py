@@ -203,16 +203,25 @@ class Posterior:
         return (first,) if self.within_gap(first) >= self.stated_from else (first, second)
 
     @property
+    def named(self) -> tuple[str, ...]:
+        """Stated faults that the answer names: the second only if both together are sure."""
+        return self.stated if self._are_sure(self.stated) else self.stated[:1]
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the named faults are together as sure as one must be to be stated alone."""
+        return self._are_sure(self.named)
+
+    def _are_sure(self, faults: Sequence[str]) -> bool:
+        return sum(map(self.within_gap, faults)) >= self.stated_from
+
+    @property
     def alike(self) -> str | None:
         """What is off, where faults that look alike are together as sure as one must be."""
         if len(self.stated) < 2:
             return None
-        sure = [
-            what
-            for what, faults in ALIKE.items()
-            if sum(map(self.within_gap, faults)) >= self.stated_from
-        ]
-        return next(iter(sure), None)
+        sure = (what for what, faults in ALIKE.items() if self._are_sure(faults))
+        return next(sure, None)
 
     def within_gap(self, fault: str) -> float:
         """Return P(fault | gap), the gap being every case but `none`."""

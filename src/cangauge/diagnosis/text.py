@@ -24,8 +24,6 @@ SLOW_S, SHORT_S = 10.0, 600.0
 duration below which slow effects hardly develop [s]."""
 LEAST_REFERENCES: Final = 3
 """References from which on probabilities are reliable."""
-SHOWN_FROM, MOST_SHOWN = 0.02, 3
-"""Probability from which a sentence lists a fault, and how many it lists."""
 SHOWN_VISIBLE: Final = ("voltage_offset", "current_offset", "resistance_growth")
 """Effects whose smallest visible size is told where there is no gap: what a user suspects first."""
 
@@ -57,43 +55,46 @@ def answer(found: Diagnosis) -> str:
 
 
 def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
-    among = f"{volts(check.among_themselves_rmse_v)} among themselves"
-    size = f"{volts(check.references_rmse_v)} ({among})"
+    """Return what the model misses on the healthy logs, and what to do about it."""
+    error_v, name = volts(check.references_rmse_v), "simulator" if found.simulator else "model"
     given = found.model.extended_model()
-    missed = [_lower(found.sentence(each.evidence, given)) for each in check.missed]
-    what = "none of the nine faults explains it"
+    missed = "; ".join(_lower(found.sentence(each.evidence, given)) for each in check.missed)
+    what = f"to it they look as if {missed}" if missed else "none of the nine faults explains it"
+    among = f"{volts(check.among_themselves_rmse_v)} among themselves"
+    lines = [f"The {name} misses the healthy logs by {error_v} ({among}): {what}."]
     if missed:
-        what = f"to it they look as if {'; '.join(missed)}"
-    name = "model" if found.simulator is None else "simulator"
-    lines = [f"The {name} misses the healthy logs by {size}: {what}."]
-    if check.missed:
-        after = volts(check.missed[-1].rmse_v)
-        lines.append(f"Error {volts(check.references_rmse_v)} → {after} with this corrected.")
-    if found.simulator is not None:
+        lines.append(f"Error {error_v} → {volts(check.missed[-1].rmse_v)} with this corrected.")
+    if found.simulator:
         return [*lines, "Correct the simulator on healthy logs first."]
-    path = found.correction_path
-    better = f", or take {path}" if path and found.is_written else ""
-    lines.append(f"Fit the model again on healthy logs{better}.")
-    return lines
+    path = found.correction_path if found.is_written else None
+    better = f", or take {path}" if path else ""
+    return [*lines, f"Fit the model again on healthy logs{better}."]
 
 
 def _lower(text: str) -> str:
     return text[0].lower() + text[1:]
 
 
+def _title(fault: str) -> str:
+    return str(FAULT[fault]["title"])
+
+
 def _what(found: Diagnosis) -> str:
+    """Return the faults that are named, and how likely they are."""
     posterior = found.posterior
     none = f"P(no fault) {percent(posterior.none)}"
     if posterior.level == "none":
-        rest = f", {_likeliest(found)}" if posterior.leans_to_fault else ""
+        rest = f", {_likeliest(posterior)}" if posterior.leans_to_fault else ""
         return f"No significant gap beyond that of healthy logs: {none}{rest}."
     sure = "" if posterior.level == "gap" else f" Likely, not certain: {none}."
     if not posterior.stated:
         unknown = percent(posterior.unknown)
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
-    texts = [found.sentence(found.best_of(fault)) for fault in posterior.stated]
-    what = ", or ".join([texts[0], *map(_lower, texts[1:])]) + "."
-    return f"{what} Likelihood: {_likeliest(found)}{_together(posterior)}.{sure}"
+    first, *others = (found.sentence(found.best_of(fault)) for fault in posterior.named)
+    if not posterior.is_sure:
+        first = f"Most likely {_lower(first)}"
+    what = ", or ".join([first, *map(_lower, others)])
+    return f"{what}. Likelihood: {_likeliest(posterior)}{_together(posterior)}.{sure}"
 
 
 def _together(posterior: Posterior) -> str:
@@ -101,33 +102,29 @@ def _together(posterior: Posterior) -> str:
     if posterior.alike is None:
         return ""
     faults = ALIKE[posterior.alike]
-    *others, last = (FAULT[fault].title for fault in faults)
+    *others, last = map(_title, faults)
     together = percent(sum(posterior.faults[fault] for fault in faults))
     return f"; the {posterior.alike} ({', '.join(others)} or {last}) {together}"
 
 
-def _likeliest(found: Diagnosis) -> str:
-    """Return the most probable faults with their probabilities, in order."""
-    posterior = found.posterior
+def _likeliest(posterior: Posterior) -> str:
+    """Return up to three faults of 2 % or more, or named, with their probabilities, in order."""
     shown = [
-        f"{FAULT[fault].title} {percent(p)}"
+        f"{_title(fault)} {percent(p)}"
         for fault, p in posterior.faults.items()
-        if p >= SHOWN_FROM or fault in posterior.stated
+        if p >= 0.02 or fault in posterior.named
     ]
-    return ", ".join(shown[:MOST_SHOWN])
+    return ", ".join(shown[:3])
 
 
 def _how_far(found: Diagnosis) -> str:
-    healthy = f"healthy logs of this pack have {volts(found.healthy_rmse_v)}"
-    if not found.has_references:
-        healthy = f"the model file states {volts(found.healthy_rmse_v)}"
-    where = clause(found.where)
+    """Return the error as it is, corrected, and of healthy logs; and where it lies."""
+    whose = "healthy logs of this pack have" if found.has_references else "the model file states"
+    where, error = clause(found.where), volts(found.baseline_rmse_v)
+    if found.is_corrected:
+        error += f" → {volts(found.extended_rmse_v)} with {_corrected(found)}"
     place = f"{where[0].upper()}{where[1:]}.{_uncertain(found)}"
-    before = volts(found.baseline_rmse_v)
-    if not found.is_corrected:
-        return f"Error {before}; {healthy}. {place}"
-    after = f"{volts(found.extended_rmse_v)} with {_corrected(found)} corrected{_other(found)}"
-    return f"Error {before} → {after}; {healthy}. {place}"
+    return f"Error {error}; {whose} {volts(found.healthy_rmse_v)}. {place}"
 
 
 def _uncertain(found: Diagnosis) -> str:
@@ -142,22 +139,17 @@ def _uncertain(found: Diagnosis) -> str:
 
 
 def _corrected(found: Diagnosis) -> str:
-    """Return what a smaller error is owed to."""
+    """Return what a smaller error is owed to; and the error with the other of two faults."""
     if found.correction is None:
-        return "the model"
-    what = "this"
-    if len(found.posterior.stated) > 1:
-        what = f"the {FAULT[found.correction.evidence.fault].title}"
-    return f"the model and {what}" if found.lacks else what
-
-
-def _other(found: Diagnosis) -> str:
-    """Return the error with the other of two stated faults corrected."""
-    return "".join(
-        f" ({volts(found.corrections[fault].rmse_v)} with the {FAULT[fault].title})"
-        for fault in found.posterior.stated
-        if found.correction is not None and fault != found.correction.evidence.fault
+        return "the model corrected"
+    mine, stated = found.correction.evidence.fault, found.posterior.stated
+    what = "this" if len(stated) == 1 else f"the {_title(mine)}"
+    others = "".join(
+        f" ({volts(found.corrections[fault].rmse_v)} with the {_title(fault)})"
+        for fault in stated
+        if fault != mine
     )
+    return f"{'the model and ' if found.lacks else ''}{what} corrected{others}"
 
 
 def _to_do(found: Diagnosis) -> str:
@@ -170,12 +162,12 @@ def _to_do(found: Diagnosis) -> str:
         ]
         shown = f" These logs would have shown {', '.join(seen)}." if seen else ""
         return f"{found.check_first}{shown}"
-    text = found.check_first
+    model = "A corrected model is at hand (--extended MODEL, `extended_model()`)."
     if found.why_not is not None:
-        return f"{text} No correction: {found.why_not}."
-    if found.correction_path:
-        return f"{text} Corrected model: {found.correction_path}"
-    return f"{text} A corrected model is at hand (--extended MODEL, `extended_model()`)."
+        model = f"No correction: {found.why_not}."
+    elif found.correction_path:
+        model = f"Corrected model: {found.correction_path}"
+    return f"{found.check_first} {model}"
 
 
 def caveats(found: Diagnosis) -> list[str]:
@@ -216,7 +208,7 @@ def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows: each fault with its probability, size and remaining error."""
     rows = [
         [
-            FAULT[fault].title,
+            _title(fault),
             percent(p),
             found.best_of(fault).shape.effect.id.replace("_", " "),
             _amount(found, fault),
@@ -241,8 +233,8 @@ def plan_text(found: Diagnosis) -> str:
         return "Next step: none; there is no fault to settle."
     fault, before, after = found.next_step
     return (
-        f"Next step: {FAULT[fault].measurement}. The probability of the true fault would rise from"
-        f" {percent(before)} to {percent(after)}."
+        f"Next step: {FAULT[fault]['measurement']}. The probability of the true fault would rise"
+        f" from {percent(before)} to {percent(after)}."
     )
 
 

@@ -60,7 +60,7 @@ def diagnosis_figure(found: Diagnosis) -> Plot:
     """Return the probabilities of the faults as bars, the likeliest first, for a notebook."""
     answer = found.posterior
     entries = [
-        (FAULT[fault].title, p, BLUE if fault in answer.stated else GREY)
+        (FAULT[fault]["title"], p, BLUE if fault in answer.stated else GREY)
         for fault, p in answer.faults.items()
     ]
     entries += [("no fault", answer.none, GREEN), ("none of these", answer.unknown, GREY)]

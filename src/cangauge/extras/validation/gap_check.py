@@ -166,7 +166,7 @@ def table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         cells = dict.fromkeys(FLOORS, NONE_KNOWN)
         for of in item["sizes"]:
             cells[of["floors"]] = "{first}/{of}, {stated_right}/{stated}".format_map(of)
-        rows.append([FAULT[item["fault"]].title, *cells.values()])
+        rows.append([FAULT[item["fault"]]["title"], *cells.values()])
     return ["fault", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
 
 
