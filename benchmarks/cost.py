@@ -189,7 +189,7 @@ def growth() -> Result:
     }
     for count in (300, 3000, 30_000):
         frames = wanted_frames(count)
-        result.setdefault("live frame, of so many [µs]", {})[count] = live_frame_us(frames)[0]
+        result.setdefault("live frame, mean over N frames [µs]", {})[count] = live_frame_us(frames)[0]
     return result
 
 
