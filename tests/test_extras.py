@@ -42,6 +42,7 @@ def test_pages_are_refused_before_anything_is_read(core_alone: None, command: st
     [
         ('dashboard = "8642"', "live"),
         ('http = "127.0.0.1:9464"', "metrics"),
+        ('[mqtt]\nbroker = "localhost"', "mqtt"),
     ],
 )
 def test_outputs_of_the_service_are_refused_by_check(

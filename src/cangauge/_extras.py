@@ -15,6 +15,7 @@ _PACKAGES: Final = {
     "fleet": "distributed",
     "live": "bokeh",
     "metrics": "tornado",
+    "mqtt": "paho",
     "report": "bokeh",
 }
 """A package of each extra that shows whether it is installed."""

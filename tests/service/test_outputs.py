@@ -20,6 +20,7 @@ def test_a_service_without_outputs_needs_the_light_install_alone() -> None:
         "filterpy",
         "jinja2",
         "matplotlib",
+        "paho",
         "pyarrow",
         "threadpoolctl",
         "tornado",

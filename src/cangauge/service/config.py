@@ -355,7 +355,9 @@ class RunConfig(BaseModel):
         restart=True,
         is_path=True,
     )
-    mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state.", restart=True)
+    mqtt: MqttConfig | None = key(
+        None, "MQTT broker that takes the state (extra `mqtt`).", restart=True
+    )
     dashboard: str | None = key(
         None,
         "Address of the live page (extra `live`). A port alone, such as 8642, serves this machine"

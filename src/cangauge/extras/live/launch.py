@@ -81,7 +81,7 @@ def check(config: RunConfig) -> None:
     if config.status_socket == "off":
         problem = "live page, status by HTTP and MQTT read the status socket"
         raise InputError(problem, field="status_socket", value="off", cure="remove it")
-    for key, needed in (("http", "metrics"), ("dashboard", "live")):
+    for key, needed in (("http", "metrics"), ("dashboard", "live"), ("mqtt", "mqtt")):
         if getattr(config, key) is not None:
             require_extra(needed, key)
     http_addresses(config)

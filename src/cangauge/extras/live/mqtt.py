@@ -1,8 +1,8 @@
 """Publish a running service's state to an MQTT broker, with Home Assistant's discovery.
 
-MQTT 3.1.1 takes few packets where nothing is subscribed. A broker may only confirm: one that sends
-anything else is left, so that it cannot fill the memory. A state that cannot be sent is dropped,
-since the next one replaces it.
+Needs paho-mqtt (extra `mqtt`), whose thread has the network. A state that cannot be sent is
+dropped, since the next one replaces it. A broker that sends messages is left: nobody has subscribed
+to any, and paho would keep those of QoS 2 without a limit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,11 @@ import re
 import socket
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
+
+from paho.mqtt.client import Client, MQTTMessageInfo
+from paho.mqtt.enums import CallbackAPIVersion
 
 from cangauge._logging import emit
 from cangauge._version import __version__
@@ -29,21 +33,13 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 KEEPALIVE_S: Final = 10
-"""A broker that does not confirm for so long counts as lost [s]. It sends the last will after half
-as long again."""
+"""A broker that is silent for this and half as long again counts as lost [s]."""
 CONNECT_WITHIN_S: Final = 3.0
-LONGEST_PAUSE_S: Final = 30.0
-"""Longest pause between attempts to connect [s]; it begins at 1 s and doubles each time."""
+RETRY_S: Final = (1, 30)
+"""First and longest pause between attempts to connect, doubled each time [s]."""
+LEAVE_WITHIN_S: Final = 0.5
+"""Time limit for saying goodbye to the broker [s]."""
 
-_KINDS: Final = {
-    "CONNECT": 0x10,
-    "CONNACK": 0x20,
-    "PUBLISH": 0x31,  # retained, sent at most once (QoS 0)
-    "PINGREQ": 0xC0,
-    "PINGRESP": 0xD0,
-    "DISCONNECT": 0xE0,
-}
-_REFUSALS: Final = {b"\4": "wrong user name or password", b"\5": "not authorised"}
 
 _SENSORS: Final = {
     "soc_pct": ("estimate.soc_pct", "State of charge", "%", "battery", 1),
@@ -98,30 +94,6 @@ def state(status: Mapping[str, Any]) -> dict[str, Any]:
     return values | {"reasons": status["reasons"]}
 
 
-def packet(kind: str, *parts: bytes | str) -> bytes:
-    """Return a packet: its kind, its length in groups of seven bits, and its parts.
-
-    A text has its length before it.
-    """
-    content = b""
-    for part in parts:
-        if isinstance(part, str):
-            content += len(part.encode()).to_bytes(2, "big") + part.encode()
-        else:
-            content += part
-    head, left = [_KINDS[kind]], len(content)
-    while left > 0x7F:
-        head.append(left & 0x7F | 0x80)
-        left >>= 7
-    return bytes([*head, left]) + content
-
-
-def message(topic: str, content: str | dict[str, Any]) -> bytes:
-    """Return the packet of a text, or of an object as JSON, for a topic."""
-    text = content if isinstance(content, str) else json.dumps(content, ensure_ascii=False)
-    return packet("PUBLISH", topic, text.encode())
-
-
 class MqttPublisher(Output):
     """Publish the latest snapshot on the running loop, every `every_s` [s].
 
@@ -144,21 +116,32 @@ class MqttPublisher(Output):
     def __init__(self, config: MqttConfig, bus: str) -> None:
         default = re.sub(r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}")
         self._config, self._device = config, config.device or default
-        self._port = config.port or (8883 if config.tls else 1883)
+        port = config.port or (8883 if config.tls else 1883)
+        self._place = f"{config.broker}:{port}"
         self._state_topic = f"{config.topic_prefix}/{self._device}/state"
         self._availability_topic = f"{config.topic_prefix}/{self._device}/availability"
         self._latest: Snapshot | None = None
-        self._tls, password = mqtt_tls(config), mqtt_password(config)
-        if password is not None and self._tls is None and not is_loopback_name(config.broker):
-            text = "the password is sent unencrypted: set tls = true in [mqtt]"
-            self._emit(logging.WARNING, "mqtt.unencrypted", text)
-        # A new session, with a last will that is confirmed and retained.
-        user = [text for text in (config.user, password) if text is not None]
-        flags = 0b00101110 | (0, 0x80, 0xC0)[len(user)]
-        head = bytes([4, flags]) + KEEPALIVE_S.to_bytes(2, "big")
-        will = self._availability_topic, "offline"
-        self._connect = packet("CONNECT", "MQTT", head, f"cangauge-{self._device}", *will, *user)
-        self._writer: asyncio.StreamWriter | None = None
+        self._is_new = self._is_closed = False
+        name = f"cangauge-{self._device}"
+        self._client = client = Client(CallbackAPIVersion.VERSION2, client_id=name)
+        client.connect_timeout = CONNECT_WITHIN_S
+        client.reconnect_delay_set(*RETRY_S)
+        client.will_set(self._availability_topic, "offline", qos=1, retain=True)
+        client.max_queued_messages_set(1)
+        password, context = mqtt_password(config), mqtt_tls(config)
+        if config.user is not None:
+            client.username_pw_set(config.user, password)
+        if context is not None:
+            client.tls_set_context(context)
+        elif password is not None and not is_loopback_name(config.broker):
+            text = f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]"
+            emit(_LOG, logging.WARNING, "mqtt.unencrypted", text)
+        client.on_log = self._on_log
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_connect_fail = self._on_connect_fail
+        client.connect_async(config.broker, port, KEEPALIVE_S)
+        client.loop_start()
         self._publishing = asyncio.ensure_future(self._run())
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -166,74 +149,32 @@ class MqttPublisher(Output):
         self._latest = snapshot
 
     def close(self) -> None:
-        """Say goodbye to the broker, which then forgets the last will; without waiting."""
+        """Say goodbye to the broker, within a limited time."""
+        self._is_closed = True
         self._publishing.cancel()
-        if self._writer is not None:
-            self._writer.write(message(self._availability_topic, "offline") + packet("DISCONNECT"))
-            self._writer.close()
+        if self._client.is_connected():
+            # A clean end makes the broker forget the last will.
+            self._send(self._availability_topic, "offline").wait_for_publish(LEAVE_WITHIN_S)
+        self._client.disconnect()
 
     async def _run(self) -> None:
-        pause_s = 1.0
+        """Publish; also while the service does not answer, whose latest state grows old."""
         while True:
-            try:
-                async with asyncio.timeout(CONNECT_WITHIN_S):
-                    reader, writer = await asyncio.open_connection(
-                        self._config.broker, self._port, ssl=self._tls
-                    )
-                    writer.write(self._connect)
-                    confirmed = await reader.readexactly(4)
-            except (OSError, EOFError):
-                text = f"not reachable; tried again after at most {LONGEST_PAUSE_S:g} s"
-                self._emit(logging.WARNING, "mqtt.unreachable", text)
-            else:
-                if confirmed in {packet("CONNACK", b"\0\0"), packet("CONNACK", b"\1\0")}:
-                    pause_s = 1.0
-                    await self._publish_to(reader, writer)
-                else:
-                    text = _REFUSALS.get(confirmed[3:], f"it answered 0x{confirmed.hex()}")
-                    self._emit(logging.WARNING, "mqtt.refused", f"refused the connection: {text}")
-                writer.close()
-            await asyncio.sleep(pause_s)
-            pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
+            await asyncio.sleep(self._config.every_s)
+            if self._latest is not None and self._client.is_connected():
+                self._publish(self._latest.at(time.monotonic()))
 
-    async def _publish_to(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Publish until the connection is lost.
+    def _publish(self, status: Mapping[str, Any]) -> None:
+        if self._is_new:
+            self._is_new = False
+            if prefix := self._config.discovery_prefix:
+                for key in _SENSORS:
+                    topic = f"{prefix}/sensor/{self._device}/{key}/config"
+                    self._send(topic, json.dumps(self._found(key, status), ensure_ascii=False))
+            self._send(self._availability_topic, "online")
+        self._send(self._state_topic, json.dumps(state(status), ensure_ascii=False))
 
-        Also while the service does not answer: its latest state then grows old.
-        """
-        self._emit(logging.INFO, "mqtt.connected", "connected")
-        self._writer, is_new, due_s = writer, True, time.monotonic()
-        try:
-            while True:
-                if self._latest is not None and time.monotonic() >= due_s:
-                    status = self._latest.at(time.monotonic())
-                    if is_new:
-                        writer.writelines(self._introduction(status))
-                    writer.write(message(self._state_topic, state(status)))
-                    is_new, due_s = False, time.monotonic() + self._config.every_s
-                writer.write(packet("PINGREQ"))
-                async with asyncio.timeout(KEEPALIVE_S):
-                    await writer.drain()
-                    answer = await reader.readexactly(2)
-                if answer != packet("PINGRESP"):
-                    raise ConnectionError(f"it sent 0x{answer.hex()}, which nobody asked for")
-                left_s = due_s - time.monotonic()
-                await asyncio.sleep(min(max(left_s, 0.1), KEEPALIVE_S))
-        except (OSError, EOFError) as error:
-            reason = str(error) or type(error).__name__
-            text = f"connection lost ({reason}); the estimate continues"
-            self._emit(logging.WARNING, "mqtt.lost", text)
-            self._writer = None
-
-    def _introduction(self, status: Mapping[str, Any]) -> list[bytes]:
-        """Return the packets that make the sensors known."""
-        prefix, found = self._config.discovery_prefix, [message(self._availability_topic, "online")]
-        for key in _SENSORS if prefix else ():
-            topic = f"{prefix}/sensor/{self._device}/{key}/config"
-            found.append(message(topic, self._sensor(key, status)))
-        return found
-
-    def _sensor(self, key: str, status: Mapping[str, Any]) -> dict[str, Any]:
+    def _found(self, key: str, status: Mapping[str, Any]) -> dict[str, Any]:
         """Return Home Assistant's configuration of a sensor."""
         _, name, unit, device_class, digits = _SENSORS[key]
         availability = [{"topic": self._availability_topic}]
@@ -267,6 +208,37 @@ class MqttPublisher(Output):
             content["state_class"] = "measurement"
         return {key: value for key, value in content.items() if value is not None}
 
+    def _send(self, topic: str, text: str) -> MQTTMessageInfo:
+        # QoS 0: unlike the others it is never queued for a broker that is away.
+        return self._client.publish(topic, text, qos=0, retain=True)
+
+    def _on_log(self, client: Client, _userdata: object, _level: object, text: str) -> None:
+        # The only place where paho tells of a message of QoS 2 before its release.
+        connection = client.socket()
+        if text.startswith("Received PUBLISH") and isinstance(connection, socket.socket):
+            self._emit(logging.WARNING, "mqtt.flooded", "it sent a message that nobody asked for")
+            with suppress(OSError):  # the broker has closed it
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def _on_connect(
+        self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
+    ) -> None:
+        if reason.is_failure:
+            self._emit(logging.WARNING, "mqtt.refused", f"refused the connection: {reason}")
+            return
+        self._is_new = True
+        self._emit(logging.INFO, "mqtt.connected", "connected")
+
+    def _on_disconnect(
+        self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
+    ) -> None:
+        if not self._is_closed:
+            text = f"connection lost ({reason}); the estimate continues"
+            self._emit(logging.WARNING, "mqtt.lost", text)
+
+    def _on_connect_fail(self, _client: Client, _userdata: object) -> None:
+        text = f"not reachable; tried again after at most {RETRY_S[1]} s"
+        self._emit(logging.WARNING, "mqtt.unreachable", text)
+
     def _emit(self, level: int, event: str, text: str) -> None:
-        text = f"MQTT broker {self._config.broker}:{self._port}: {text}"
-        emit(_LOG, level, event, text, limit="mqtt")
+        emit(_LOG, level, event, f"MQTT broker {self._place}: {text}")
