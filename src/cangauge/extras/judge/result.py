@@ -58,7 +58,7 @@ class Judgement:
 
     Attributes
     ----------
-    logs : tuple of Log
+    logs : list of Log
         In order of time.
     model : Model
     fits : list of Fitted
@@ -74,7 +74,7 @@ class Judgement:
         Whether a charge ended full in these logs.
     """
 
-    logs: tuple[Log, ...]
+    logs: list[Log]
     model: Model
     fits: list[Fitted]
     corrected_pct: list[FloatArray]
