@@ -306,11 +306,12 @@ def narrowed(judgement: Judgement) -> Model:
     Raises
     ------
     InputError
-        If the model is a published equation, whose curve has no knots.
+        For a model of the published equation, which states no error of its curve.
     """
     model, before, given = judgement.model, judgement.model.curve, judgement.model.loads
     if before is None or given is None or given.arrhenius is None:
-        raise InputError("a published equation has no curve to narrow", field="--output")
+        problem = "the model states no error of its curve that logs could narrow"
+        raise InputError(problem, field="--output", cure="make the model by `cangauge fit`")
     functions, best = model.principal_functions(), judgement.fits[0]
     of = slice(len(best.faults), len(best.faults) + functions.number)
     mean, covariance = best.posterior.mean[of], best.posterior.covariance[of, of]
