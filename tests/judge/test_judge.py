@@ -309,6 +309,22 @@ def test_a_weak_cell_is_named_and_the_pack_is_as_empty_as_it(pack: Pack, lack_pc
     assert judgement.error_pct == pytest.approx(behind, abs=3.0 * judgement.error_std_pct)
 
 
+def test_cell_voltages_stay_with_their_logs(pack: Pack) -> None:
+    model, logs = pack
+    dated, cells = [], []
+    for day, log in enumerate(logs[:2]):
+        dated.append(replace(log, time_s=log.time_s + 1.7e9 + 86400.0 * day))
+        lack = np.r_[12.0, np.zeros(11)] / 100.0
+        theirs = 100.0 - (100.0 - log.soc_pct[:, None]) / (1.0 - lack)
+        curve = model.voltage_model().pseudo_ocv
+        change = curve(theirs.ravel()).reshape(theirs.shape) - curve(log.soc_pct)[:, None]
+        cells.append(CellColumns(1, (log.voltage_v[:, None] + change) / 12.0))
+    found = cangauge.judge(dated, model, cell_voltages=cells).to_dict()
+    turned = cangauge.judge(dated[::-1], model, cell_voltages=cells[::-1]).to_dict()
+    assert found["faults"][0]["fault"] == "weak_cell"
+    assert turned == found
+
+
 def test_a_weak_cell_is_not_read_below_its_empty(pack: Pack) -> None:
     model, _ = pack
     rng = np.random.default_rng(2)

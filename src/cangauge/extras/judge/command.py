@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
-from cangauge._files import atomic_path
-from cangauge._text import number, printable
+from cangauge._files import write_texts_atomic
+from cangauge._text import number
 from cangauge.cli.options import (
     CAPACITY_AH,
     CELLS,
@@ -26,7 +22,7 @@ from cangauge.cli.options import (
     command,
     option,
 )
-from cangauge.cli.output import finish, note, print_table, progress
+from cangauge.cli.output import finish, print_table, progress, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -129,14 +125,11 @@ def judge_command(
         from cangauge.extras.judge.page import judge_page
 
         texts[report] = judge_page(judgement, model).html()
-    with ExitStack() as both:
-        for path, text in texts.items():
-            both.enter_context(atomic_path(path)).write_text(text, encoding="utf-8", newline="\n")
-        if corrected is not None:
-            _write_corrected(corrected, judgement)
-    result = judgement.to_dict(None if corrected is None else str(corrected))
-    written = [path for path in (output, corrected, report) if path is not None]
-    finish(result, partial(_show, judgement, written), as_json=json_output)
+    write_texts_atomic(texts)
+    if corrected is not None:
+        _write_corrected(corrected, judgement)
+    files = {"corrected": corrected, "narrowed": output, "report": report}
+    finish(judgement.to_dict(), partial(say, judgement.text), files, as_json=json_output)
 
 
 def _suite(
@@ -156,27 +149,24 @@ def _suite(
             else recorded_drives(sorted(data.iterdir()), Model.load(model))
         )
         scores = run_suite(started_by, drives, show=show)
-    rows = [
-        [
-            score["fault"],
-            number(score["mae_pct"], 2),
-            number(score["worst_pct"], 1),
-            number(score["jumps_per_h"], 1),
-            "never" if score["recovery_s"] == math.inf else number(score["recovery_s"] / 60.0, 0),
-            number(None if score["cover_2sigma"] is None else 100.0 * score["cover_2sigma"], 0),
-            number(100.0 * score["silent"], 0),
-        ]
-        for score in scores
-    ]
-    head = [
-        "fault",
-        "MAE [%]",
-        "worst [%]",
-        "jumps/h",
-        "within 5 % after [min]",
-        "within 2σ [%]",
-        "silent [%]",
-    ]
+    # Heading: score, scale and decimals.
+    columns = {
+        "MAE [%]": ("mae_pct", 1.0, 2),
+        "worst [%]": ("worst_pct", 1.0, 1),
+        "jumps/h": ("jumps_per_h", 1.0, 1),
+        "within 5 % after [min]": ("recovery_s", 1.0 / 60.0, 0),
+        "within 2σ [%]": ("cover_2sigma", 100.0, 0),
+        "silent [%]": ("silent", 100.0, 0),
+    }
+    head, rows = ["fault", *columns], []
+    for score in scores:
+        values = [(score[key], scale, digits) for key, scale, digits in columns.values()]
+        rows.append(
+            [
+                score["fault"],
+                *(number(value and scale * value, digits) for value, scale, digits in values),
+            ]
+        )
     result = {"schema": 1, "gauge": " ".join(started_by), "scores": scores}
     finish(result, partial(print_table, f"{len(drives)} drives", head, rows), as_json=json_output)
 
@@ -196,9 +186,3 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
         "corrected_std_pct": np.concatenate(judgement.corrected_std_pct),
     }
     write_table(columns, path)
-
-
-def _show(judgement: Judgement, written: Sequence[Path]) -> None:
-    typer.echo(printable(judgement.text))
-    for path in written:
-        note(f"wrote {path}")

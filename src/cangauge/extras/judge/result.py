@@ -117,7 +117,7 @@ class Judgement:
         own_s = time_s - float(self.logs[log].time_s[0])
         return own_s + sum(log.duration_s for log in self.logs[:log])
 
-    def to_dict(self, corrected: str | None = None) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the object of `--json`, schema 2."""
         return {
             "schema": 2,
@@ -151,7 +151,6 @@ class Judgement:
                 for fault in self.faults
             ],
             "next_step": self.next_step,
-            "corrected": corrected,
         }
 
 

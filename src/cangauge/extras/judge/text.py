@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from cangauge._text import duration, number
-from cangauge.extras.judge.faults import FAULTS
+from cangauge.extras.judge.faults import FAULTS, OTHERWISE
 from cangauge.extras.judge.gauge import LIMIT_PCT
 from cangauge.model.model_file import PRIOR_MADE_BY
 
@@ -26,29 +26,6 @@ NAMED: Final = 0.9
 """Probability from which a fault is named, or a gauge agrees."""
 SURE: Final = 1.96
 """Half width of an interval of 95 % in standard deviations."""
-
-NOTHING: Final = "Nothing to do."
-UNKNOWN: Final = (
-    "Log one hour of rest and one full charge until its end: they settle whether the SoC, the"
-    " current or the voltage is wrong."
-)
-RESET_AT_FULL: Final = (
-    "The pack was charged full in these logs: check at which voltage and current the gauge sets"
-    " itself to 100 %."
-)
-BY_CHARGE: Final = (
-    "Add a log of one full charge until its end: it settles the SoC, which the flat voltage of LFP"
-    " cells does not."
-)
-BY_MODEL: Final = (
-    "Fit a model of the pack (`cangauge fit`) to drives whose SoC is known, and judge with -m: a"
-    " typical cell leaves the SoC open by several percent."
-)
-BY_REST: Final = (
-    "Add a log with an hour of rest after a drive of 40 % or more, or of one full charge until its"
-    " end: it settles the SoC."
-)
-ITS_SENSOR: Final = " Such a log also shows whether the current sensor is off."
 
 
 def lines_of(judgement: Judgement) -> list[str]:
@@ -132,29 +109,29 @@ def _cause(judgement: Judgement, fault: FoundFault) -> str:
 def _next_step(judgement: Judgement) -> str:
     if judgement.pieces[-1].stands_at_pct is not None:
         return FAULTS["stands_still"].next_step
-    names = [fault.name for fault in judgement.faults if fault.name != "stands_still"]
     if judgement.verdict == "cannot_tell":
         return _telling(judgement)
+    names = [fault.name for fault in judgement.faults if fault.name != "stands_still"]
     if judgement.verdict == "agrees" and set(names) <= {"start_or_reset"}:
-        return NOTHING
+        return OTHERWISE["nothing"]
     if not names:
-        return UNKNOWN
+        return OTHERWISE["cause_unknown"]
     if names[0] == "start_or_reset" and judgement.was_full:
-        return RESET_AT_FULL
+        return OTHERWISE["reset_at_full"]
     return FAULTS[names[0]].next_step
 
 
 def _telling(judgement: Judgement) -> str:
     """Return the one log that would tell."""
     if judgement.model.chemistry != "lfp" and judgement.model.made.by == PRIOR_MADE_BY:
-        return BY_MODEL
-    step = BY_CHARGE if judgement.model.chemistry == "lfp" else BY_REST
+        return OTHERWISE["cannot_tell_typical"]
+    step = OTHERWISE["cannot_tell_lfp" if judgement.model.chemistry == "lfp" else "cannot_tell"]
     offset = sum(
         fit.share
         for fit in judgement.fits
         if "current_offset" in [each.fault for each in fit.faults]
     )
-    return step + (ITS_SENSOR if offset > 1.0 - NAMED else "")
+    return step + OTHERWISE["shows_offset"] if offset > 1.0 - NAMED else step
 
 
 def moment(judgement: Judgement, at: Moment) -> str:
