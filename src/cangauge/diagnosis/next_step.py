@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
 
 import numpy as np
 
+from cangauge._typing import FloatArray
 from cangauge.diagnosis.evidence import Evidence
 from cangauge.diagnosis.posterior import Posterior
-
-RESOLUTION: Final = 0.025
-"""Resolution of a measurement without a healthy scatter, in bounds of the effect."""
 
 
 def next_step(
@@ -23,47 +20,29 @@ def next_step(
     """
     if not posterior.stated:
         return None
-    tried = {fault: _expected(evidence, posterior, fault) for fault in posterior.stated}
-    after, before, fault = max((after, before, fault) for fault, (before, after) in tried.items())
-    return fault, before, after
+    now = np.array([posterior.faults[fault] for fault in posterior.stated])
+    after, measured = max(
+        (float(now @ _settled(evidence, posterior, fault)), fault) for fault in posterior.stated
+    )
+    return measured, float(now @ now / now.sum()), after / float(now.sum())
 
 
-def _expected(
-    evidence: Mapping[str, Evidence], posterior: Posterior, measured: str
-) -> tuple[float, float]:
-    """Return the probability of the truth among the stated faults, now and after a measurement.
+def _settled(evidence: Mapping[str, Evidence], posterior: Posterior, measured: str) -> FloatArray:
+    """Return the probability of each stated fault that is expected after a measurement, if true.
 
-    A measurement reads the size of its fault, and nothing of the others.
+    A measurement reads the size of its fault, and nothing of the others; an unknown fault may show
+    either. Its resolution is the healthy scatter, else 2.5 % of the bound.
     """
     of = evidence[next(iter(posterior.effects(measured)))]
-    resolution = of.shape.usual or RESOLUTION * of.shape.bound
+    resolution = of.shape.usual or 0.025 * of.shape.bound
     spread = float(np.hypot(resolution, of.std))
     nodes, weights = np.polynomial.hermite_e.hermegauss(7)
-    now = np.array([posterior.faults[fault] for fault in posterior.stated])
-    after = []
-    for fault in posterior.stated:
-        mean, std = (of.size, spread) if fault == measured else (0.0, resolution)
-        each = []
-        for reading in (mean + std * nodes).tolist():
-            here = _density(reading, of.size, spread)
-            others = _density(reading, 0.0, resolution)
-            each.append(_settled(posterior, measured, here, others)[fault])
-        after.append(float(weights @ each / weights.sum()))
-    return float(now @ now / now.sum()), float(now @ after / now.sum())
-
-
-def _settled(posterior: Posterior, measured: str, here: float, others: float) -> dict[str, float]:
-    """Return the probability of each fault after a reading, by Bayes' rule.
-
-    `here` and `others` are the densities of the reading with the measured fault and without; an
-    unknown fault may have either.
-    """
-    found = {fault: p * others for fault, p in posterior.faults.items()}
-    found[measured] = posterior.faults[measured] * here
-    unknown = posterior.unknown * 0.5 * (here + others)
-    total = sum(found.values()) + posterior.none * others + unknown
-    return {fault: p / total for fault, p in found.items()}
-
-
-def _density(x: float, mean: float, std: float) -> float:
-    return max(float(np.exp(-0.5 * ((x - mean) / std) ** 2) / std), 1e-300)
+    p = np.array([posterior.faults[fault] for fault in posterior.stated])[:, None]
+    is_measured = np.array([fault == measured for fault in posterior.stated])[:, None]
+    reading = np.where(is_measured, of.size + spread * nodes, resolution * nodes)
+    here = np.exp(-0.5 * ((reading - of.size) / spread) ** 2) / spread
+    none_of_it = np.exp(-0.5 * (reading / resolution) ** 2) / resolution
+    fault, unknown = posterior.faults[measured], posterior.unknown
+    total = (fault + 0.5 * unknown) * here + (1.0 - fault - 0.5 * unknown) * none_of_it
+    after = p * np.where(is_measured, here, none_of_it) / np.maximum(total, 1e-300)
+    return np.asarray(after @ weights / weights.sum())

@@ -16,7 +16,6 @@ features are fitted to labelled cases with packs held out (`benchmarks/weights`)
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -25,7 +24,7 @@ from operator import itemgetter
 from typing import Any, Final, get_args
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.evidence import Evidence
@@ -68,14 +67,14 @@ class Features:
 
     Parameters
     ----------
-    effects : dict of str to (float, float, float)
+    effects : dict of str to array of shape (3,)
         ln(1 + n_k/o_k), −ln(1 + V_k/v) and −ln(1 + (n_max − n_k)/o_k) of each effect.
     outer : array
         ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, ln(V/v), 1; V is
         the mean square error, and v that of a healthy log at these SoC and temperatures.
     """
 
-    effects: dict[str, tuple[float, float, float]]
+    effects: dict[str, FloatArray]
     outer: FloatArray
 
 
@@ -84,53 +83,33 @@ def features(
 ) -> Features:
     """Return what the posterior sees of a case."""
     v = healthy.healthy_v2 + max(healthy.open_v2(logs) - healthy.mean_open_v2, 0.0)
-    nats = {name: max(e.nats, 0.0) for name, e in evidence.items()}
-    n_max = max(nats[name] * healthy.excess_of(name) for name in nats)
-    effects = {}
-    for name, e in evidence.items():
-        lacking = n_max / healthy.excess_of(name) - nats[name]
-        effects[name] = (
-            math.log1p(nats[name]),
-            -math.log1p(e.left_v2 / v),
-            -math.log1p(lacking),
-        )
-    explained = {name: each[0] + each[1] for name, each in effects.items()}
-    best = max(explained, key=explained.__getitem__)
-    most = math.log1p(max(nats.values()))
-    usual = float(np.mean(np.log1p(healthy.nats))) if healthy.nats else math.log1p(UNTESTED)
-    gap = math.log(healthy.gap_v2(logs) / v)
-    gap -= 0.0 if healthy.nats else 2.0 * math.log(UNTESTED)
-    left = math.log(evidence[best].left_v2 / v + 0.1)
-    return Features(effects, np.array([left, most, most - usual, gap, 1.0]))
+    over = np.array([healthy.excess_of(name) for name in evidence])
+    nats = np.maximum([e.nats for e in evidence.values()], 0.0)
+    left = np.array([e.left_v2 for e in evidence.values()]) / v
+    lacking = np.max(nats * over) / over - nats
+    each = np.column_stack([np.log1p(nats), -np.log1p(left), -np.log1p(lacking)])
+    best, most = int(np.argmax(each[:, 0] + each[:, 1])), float(np.log1p(nats.max()))
+    usual = np.mean(np.log1p(healthy.nats or UNTESTED))
+    gap = healthy.gap_v2(logs) / v / (1.0 if healthy.nats else UNTESTED**2)
+    outer = np.array([np.log(left[best] + 0.1), most, most - usual, np.log(gap), 1.0])
+    return Features(dict(zip(evidence, each, strict=True)), outer)
 
 
 def probabilities(case: Features, by: Mapping[str, Any]) -> dict[str, float]:
     """Return the probability of `none`, `unknown` and every effect; they sum to 1."""
-    inner, exponent = by["inner"], by["exponent"]
-    u = {
-        fault: np.array(
-            [np.dot(inner, x) for name, x in case.effects.items() if _is_of(name, fault)]
-        )
-        for fault in FAULTS
-    }
-    value = {
-        fault: exponent * (float(logsumexp(each)) - math.log(each.size))
-        for fault, each in u.items()
-    }
-    library, (slope, offset) = float(logsumexp(list(value.values()))), by["library"]
-    outer = np.array([case.outer @ by[NONE], case.outer @ by[UNKNOWN], slope * library + offset])
-    none, unknown, any_fault = np.exp(outer - logsumexp(outer)).tolist()
-    found = {NONE: none, UNKNOWN: unknown}
+    value, within = [], {}
     for fault in FAULTS:
-        p = any_fault * math.exp(value[fault] - library)
-        within = np.exp(u[fault] - logsumexp(u[fault])).tolist()
-        names = [name for name in case.effects if _is_of(name, fault)]
-        found |= {name: p * part for name, part in zip(names, within, strict=True)}
+        names = [name for name in case.effects if LIBRARY[name].fault == fault]
+        u = np.array([np.dot(by["inner"], case.effects[name]) for name in names])
+        value.append(by["exponent"] * (logsumexp(u) - np.log(u.size)))
+        within[fault] = dict(zip(names, softmax(u).tolist(), strict=True))
+    slope, offset = by["library"]
+    outer = [case.outer @ by[NONE], case.outer @ by[UNKNOWN], slope * logsumexp(value) + offset]
+    none, unknown, any_fault = softmax(outer).tolist()
+    found = {NONE: none, UNKNOWN: unknown}
+    for p, parts in zip((any_fault * softmax(value)).tolist(), within.values(), strict=True):
+        found |= {name: p * part for name, part in parts.items()}
     return found
-
-
-def _is_of(effect: str, fault: str) -> bool:
-    return LIBRARY[effect].fault == fault
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +143,7 @@ class Posterior:
     @cached_property
     def faults(self) -> dict[str, float]:
         """Probability of each fault, most probable first."""
-        sums = dict.fromkeys(FAULTS, 0.0)
-        for name, p in self.probabilities.items():
-            if name in LIBRARY:
-                sums[LIBRARY[name].fault] += p
+        sums = {fault: sum(self.effects(fault).values()) for fault in FAULTS}
         return dict(sorted(sums.items(), key=itemgetter(1), reverse=True))
 
     def effects(self, fault: str) -> dict[str, float]:
