@@ -100,7 +100,7 @@ def test_a_log_that_is_its_own_reference_or_too_short_is_refused(
     made: Path, faulty: list[object], drives: Path, tmp_path: Path
 ) -> None:
     options = ("--reference", drives / "trip.csv", "--extended", tmp_path / "never.json")
-    refused(in_process(*faulty, *options), "trip.csv", "is both a LOG and a reference")
+    refused(in_process(*faulty, *options), "trip.csv", "either as LOG or as reference")
     assert not (tmp_path / "never.json").exists()
     write_log(drive(21, 80.0).rows(slice(0, 60)), tmp_path / "stub.csv")
     ran = in_process("gap", tmp_path / "stub.csv", "-m", made / "model.json")

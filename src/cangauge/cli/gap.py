@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -148,7 +147,6 @@ def gap_command(
 
     added, healthy = list(add_test or []), list(reference or [])
     paths = [*logs, *added]
-    _refuse(paths, healthy, (model, simulated, simulator))
     model_file = None if model is None else Model.load(model)
     if model_file is not None and capacity_ah is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
@@ -191,39 +189,27 @@ def gap_command(
     finish(result, partial(_show, found, before, plan, texts), as_json=json_output)
 
 
-def _refuse(
-    logs: list[Path], references: list[Path], models: tuple[Path | None, str | None, str | None]
-) -> None:
-    """Refuse a log that is its own reference, and two simulators or no model."""
-    if models == (None, None, None):
-        cure = "give the model file, or --simulated or --simulator"
-        raise InputError("no model", field="--model", cure=cure)
-    if None not in models[1:]:
-        raise InputError("two simulators", field="--simulator", value=models[2], cure="give one")
-    known = {os.path.realpath(path) for path in references}
-    for path in (path for path in logs if os.path.realpath(path) in known):
-        problem = "is both a LOG and a reference, which must be without the fault"
-        raise InputError(problem, source=path, field="--reference", cure="give it as one of them")
-
-
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
     from cangauge.logs.charge import refuse_contradictions
     from cangauge.model.coulomb_counting import difference_from_reference
 
     refuse_contradictions(logs, capacity_ah)
-    for difference in filter(None, (difference_from_reference(log, capacity_ah) for log in logs)):
-        note(f"warning: {difference}")
+    for log in logs:
+        if difference := difference_from_reference(log, capacity_ah):
+            note(f"warning: {difference}")
 
 
 def _simulation(
     heading: str | None, function: str | None, logs: list[Log], reading: ReadingOptions
 ) -> Any:
     """Return the simulator, or the voltage that it wrote into a column of each log, by log."""
-    if function is not None:
-        return load_function(function)
-    if heading is None:
-        return None
-    return {log.source or log.name: _column_of(log, heading, reading) for log in logs}
+    if function is None:
+        return heading and {
+            log.source or log.name: _column_of(log, heading, reading) for log in logs
+        }
+    if heading is not None:
+        raise InputError("two simulators", field="--simulator", value=function, cure="give one")
+    return load_function(function)
 
 
 def _column_of(log: Log, heading: str, reading: ReadingOptions) -> FloatArray:
@@ -258,8 +244,6 @@ def load_function(text: str) -> Callable[..., Any]:
     """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
     cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
-    if not (place and name):
-        raise InputError("not a function", field="--simulator", value=text, cure=cure)
     sys.path.insert(0, "")  # modules of the working directory too
     try:
         is_file = place.endswith(".py")
@@ -269,10 +253,10 @@ def load_function(text: str) -> Callable[..., Any]:
         raise InputError(problem, field="--simulator", value=text, cure=cure) from error
     finally:
         sys.path.remove("")
-    if callable(function := names.get(name)):
-        return function  # type: ignore[no-any-return]
-    problem = f"{place} has no function {name}"
-    raise InputError(problem, field="--simulator", value=text, cure=cure)
+    if not callable(function := names.get(name)):
+        problem = f"{place} has no function {name}"
+        raise InputError(problem, field="--simulator", value=text, cure=cure)
+    return function  # type: ignore[no-any-return]
 
 
 def _show(found: Diagnosis, before: Diagnosis | None, plan: bool, written: Iterable[Path]) -> None:

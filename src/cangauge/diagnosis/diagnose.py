@@ -366,7 +366,8 @@ def diagnose(
             simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
             logs, own, model = simulator.logs, simulator.references, simulator.model
         if model is None:
-            raise InputError("no model", field="model", cure="give a model, or a simulation")
+            cure = "give a model (--model), or a simulation (--simulated, --simulator)"
+            raise InputError("no model", field="model", cure=cure)
         check_logs(logs, own, model)
         _LOG.info("reading the logs")
         traces, remarks = _traces(logs, model, initial_soc_pct)
