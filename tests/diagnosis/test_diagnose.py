@@ -12,8 +12,8 @@ from days import FAULTS, day, more_amperes, more_resistance, more_volts, scaled_
 
 from cangauge.diagnosis import FAULTS as NINE
 from cangauge.diagnosis import Diagnosis, Healthy, Posterior, diagnose
-from cangauge.diagnosis.faults import sentence
 from cangauge.diagnosis.model_check import ModelCheck
+from cangauge.diagnosis.text import sentence
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -317,7 +317,7 @@ def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:
 
 def test_a_sentence_has_the_sign_of_its_unit(healthy: Diagnosis) -> None:
     for of in healthy.evidence.values():
-        said = sentence(of, healthy.healthy.model.pack, "It", 80.0)
+        said = sentence(healthy, of, healthy.healthy.model.pack)
         assert "ohm" not in said
         assert " 1 (" not in said
 

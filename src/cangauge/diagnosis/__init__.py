@@ -17,9 +17,8 @@ posterior    one calibrated posterior of none, unknown and nine faults
 model_check  whether the model describes the healthy logs, and what it misses
 correction   the model with an effect, judged on left-out rows
 where        excess of the error over SoC, temperature, current, rest and time
-faults       what a user reads of each fault, and the measurement to do first
 next_step    the measurement that settles the answer
-text         the answer in three lines
+text         the answer in three lines; `words.toml` has the words of each fault
 as_json      the whole answer as `gap --json` prints it
 checks       logs that cannot be diagnosed
 simulator    the same for any simulator's voltage

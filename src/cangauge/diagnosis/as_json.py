@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from cangauge._files import file_sha256, text_sha256
 from cangauge.diagnosis.evidence import Evidence, Quantity
-from cangauge.diagnosis.faults import FAULT
 from cangauge.diagnosis.posterior import Posterior
+from cangauge.diagnosis.text import FAULT
 from cangauge.diagnosis.where import closed_part
 from cangauge.logs.log import Log
 

@@ -18,7 +18,6 @@ from cangauge.diagnosis.as_json import as_json
 from cangauge.diagnosis.checks import check_logs
 from cangauge.diagnosis.correction import Correction, errors_of, model_file
 from cangauge.diagnosis.evidence import Evidence, analyse, learn
-from cangauge.diagnosis.faults import FAULT, sentence
 from cangauge.diagnosis.model_check import ModelCheck, check_model
 from cangauge.diagnosis.next_step import next_step
 from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
@@ -119,12 +118,6 @@ class Diagnosis:
     def best_of(self, fault: str) -> Evidence:
         """Return the evidence of the most probable effect of a fault."""
         return self.evidence[next(iter(self.posterior.effects(fault)))]
-
-    def sentence(self, evidence: Evidence, model: ExtendedModel | None = None) -> str:
-        """Return what an effect does to a model and how much, without the end of the sentence."""
-        log = "The log" if len(self.rows) == 1 else "The first log"
-        pack = (model or self.healthy.model).pack
-        return sentence(evidence, pack, log, self.rows[0].trace.start_pct)
 
     @cached_property
     def correction(self) -> Correction | None:
@@ -244,7 +237,7 @@ class Diagnosis:
     def check_first(self) -> str:
         """What to do first, in a sentence."""
         if self.next_step is not None:
-            return str(FAULT[self.next_step[0]]["instruction"])
+            return str(text.FAULT[self.next_step[0]]["instruction"])
         if self.posterior.level == "none":
             if self.posterior.leans_to_fault:
                 return "Nothing to repair yet: diagnose one more log like these with them."

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING, Final
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from cangauge._text import counted, number, significant
-from cangauge.diagnosis.faults import FAULT, shown_unit
 from cangauge.diagnosis.posterior import ALIKE, Posterior
 from cangauge.diagnosis.rows import COVER_PCT
 from cangauge.diagnosis.simulator import correction
@@ -17,7 +20,14 @@ from cangauge.logs.gaps import bridge_s
 
 if TYPE_CHECKING:
     from cangauge.diagnosis.diagnose import Diagnosis
+    from cangauge.diagnosis.evidence import Evidence
     from cangauge.diagnosis.model_check import ModelCheck
+    from cangauge.model.effects.base import Pack
+
+FAULT: Final[Mapping[str, Mapping[str, Any]]] = tomllib.loads(
+    files("cangauge.diagnosis").joinpath("words.toml").read_text("utf-8")
+)
+"""Fault → its words; see `words.toml`."""
 
 SLOW_S, SHORT_S = 10.0, 600.0
 """Interval of rows that no longer follow the load, the shortest memory of both equations; and the
@@ -26,6 +36,11 @@ LEAST_REFERENCES: Final = 3
 """References from which on probabilities are reliable."""
 SHOWN_VISIBLE: Final = ("voltage_offset", "current_offset", "resistance_growth")
 """Effects whose smallest visible size is told where there is no gap: what a user suspects first."""
+
+
+def shown_unit(unit: str) -> str:
+    """Return the unit of a parameter as a reader sees it."""
+    return "" if unit == "1" else unit.replace("ohm", "Ω")
 
 
 def percent(probability: float) -> str:
@@ -38,6 +53,48 @@ def percent(probability: float) -> str:
 def volts(value: float) -> str:
     """Return a voltage error with two significant digits."""
     return significant(value, 2, "V")
+
+
+def sentence(found: Diagnosis, evidence: Evidence, pack: Pack) -> str:
+    """Return what an effect does to a pack, how much and how sure, without the sentence's end."""
+    shape, size, half = evidence.shape, evidence.size, evidence.half_width
+    values, words = shape.values(size), FAULT[shape.effect.fault]
+    key = f"{shape.effect.id}_late" if values.get("late") else shape.effect.id
+    if key not in words["effects"]:
+        return f"{words['title'].capitalize()}: {key.replace('_', ' ')}"
+    low, high = size - half, size + half
+    now, least, most = (pack.capacity_ah * (1.0 + each / 100.0) for each in (size, low, high))
+
+    def shown(factor: float, unit: str) -> str:
+        """Return the absolute size with its interval; the bracket stays open."""
+        value, wide = factor * abs(size), factor * half
+        digits = 2 if value < 100.0 else 3
+        least = significant(max(value - wide, 0.0), digits)
+        most = significant(value + wide, digits, unit)
+        return f"{significant(value, digits, unit)} ({least}–{most}"
+
+    start_pct = found.rows[0].trace.start_pct
+    fields = {
+        "log": "The log" if len(found.rows) == 1 else "The first log",
+        "size": shown(1.0, shown_unit(shape.unit)),
+        "percent": shown(100.0, "%"),
+        "milli": shown(1e3, f"m{shape.unit}"),
+        "at_pack_v": shown(pack.voltage_v / 100.0, "V"),
+        "at_pack_ohm": shown(pack.resistance_ohm, "Ω"),
+        "of_voltage": number(100.0 * abs(size) / pack.voltage_v, 1, "%"),
+        "of_gain": number(abs(size), 1, "%"),
+        "of_share": number(100.0 * abs(size), 0, "%"),
+        "end": shape.name.removeprefix("at_"),
+        "stated_pct": start_pct,
+        "true_pct": start_pct + size,
+        "pct": f"({start_pct + low:.0f}–{start_pct + high:.0f} %)",
+        "true_ah": significant(now, 3, "Ah"),
+        "ah": f"({significant(least, 3)}–{significant(most, 3, 'Ah')})",
+        "assumed_ah": significant(pack.capacity_ah, 3, "Ah"),
+    }
+    minutes = {f"{each[:-2]}_min": v / 60.0 for each, v in values.items() if each.endswith("_s")}
+    text = re.sub(r"\[(.*?)\|(.*?)\]", r"\1" if size > 0.0 else r"\2", words["effects"][key])
+    return text.format_map(values | minutes | fields)
 
 
 def answer(found: Diagnosis) -> str:
@@ -57,8 +114,8 @@ def answer(found: Diagnosis) -> str:
 def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     """Return what the model misses on the healthy logs, and what to do about it."""
     error_v, name = volts(check.references_rmse_v), "simulator" if found.simulator else "model"
-    given = found.model.extended_model()
-    missed = "; ".join(_lower(found.sentence(each.evidence, given)) for each in check.missed)
+    given = found.model.extended_model().pack
+    missed = "; ".join(_lower(sentence(found, each.evidence, given)) for each in check.missed)
     what = f"to it they look as if {missed}" if missed else "none of the nine faults explains it"
     among = f"{volts(check.among_themselves_rmse_v)} among themselves"
     lines = [f"The {name} misses the healthy logs by {error_v} ({among}): {what}."]
@@ -90,7 +147,9 @@ def _what(found: Diagnosis) -> str:
     if not posterior.stated:
         unknown = percent(posterior.unknown)
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
-    first, *others = (found.sentence(found.best_of(fault)) for fault in posterior.named)
+    first, *others = (
+        sentence(found, found.best_of(fault), found.healthy.model.pack) for fault in posterior.named
+    )
     if not posterior.is_sure:
         first = f"Most likely {_lower(first)}"
     what = ", or ".join([first, *map(_lower, others)])

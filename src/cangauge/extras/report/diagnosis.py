@@ -9,8 +9,7 @@ from typing import Any, Final
 
 from cangauge._text import number, span
 from cangauge.diagnosis import Diagnosis
-from cangauge.diagnosis.faults import FAULT
-from cangauge.diagnosis.text import fault_rows, percent, plan_text
+from cangauge.diagnosis.text import FAULT, fault_rows, percent, plan_text
 from cangauge.diagnosis.where import stands_out, surely
 from cangauge.extras.report.charts import (
     BLUE,

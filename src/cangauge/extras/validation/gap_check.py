@@ -16,7 +16,7 @@ import numpy as np
 
 from cangauge._text import NONE_KNOWN, number
 from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
-from cangauge.diagnosis.faults import FAULT
+from cangauge.diagnosis.text import FAULT
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.faults import Fault, fault_kinds
 from cangauge.extras.validation.twin.injection import inject, scale_injection
