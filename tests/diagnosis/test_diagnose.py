@@ -105,6 +105,16 @@ def test_the_own_soc_of_a_log_is_evidence_of_the_current(known: Healthy, model: 
     )
 
 
+def test_a_gauge_that_stands_still_in_a_reference_says_nothing(
+    references: list[Log], model: Model
+) -> None:
+    short = day(14).rows(slice(0, 400))
+    still = replace(short, soc_pct=np.full(len(short), 85.0), name="still")
+    found = diagnose([more_volts(day(20), 6.0)], model, [*references, still])
+    assert found.posterior.level == "gap"
+    assert "voltage_reading" in found.posterior.stated
+
+
 def test_a_reference_at_soc_of_its_own_shows_no_healthy_error(
     references: list[Log], known: Healthy, model: Model
 ) -> None:

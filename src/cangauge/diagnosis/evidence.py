@@ -148,11 +148,19 @@ def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> Rows:
         table = healthy.rows_of(log).table
         shapes = np.where(column >= 0, table[:, n + column], 0.0)
         tables.append(np.column_stack([table[:, :n], shapes, table[:, -1]]))
-        beyond, std = healthy.own_soc(log, log.simulated.plain.soc_pct)
-        if beyond:
-            counts = np.where(column >= 0, log.count_by_shape[column], 0.0)
-            tables.append(np.r_[np.zeros(n), counts / std, beyond][None, :])
+        if beyond := healthy.own_soc(log, log.simulated.plain.soc_pct):
+            counts = np.array([_moved(shape, healthy, log, beyond) for shape in healthy.tried])
+            counts = np.where(column >= 0, counts[column], 0.0)
+            tables.append(np.r_[np.zeros(n), counts, beyond][None, :])
     return Rows(np.concatenate(tables), 0.0).reduced()
+
+
+def _moved(shape: Shape, healthy: Healthy, log: LogRows, beyond: float) -> float:
+    """Return the change of what `own_soc` returned without a shape, by it at its bound."""
+    if shape.effect.fault not in ("current_reading", "capacity"):
+        return 0.0
+    changed = log.simulated.with_effect(shape.effect, shape.values(shape.about)).soc_pct
+    return (beyond - healthy.own_soc(log, changed)) * shape.bound / shape.about
 
 
 def _trials(tried: Sequence[Shape], logs: int) -> IntArray:

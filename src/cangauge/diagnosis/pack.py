@@ -87,10 +87,6 @@ class LogRows:
     """Of the rows that count, each times the root of its seconds."""
     rows: Rows
     """The same, triangular."""
-    own_change: tuple[float, float] | None
-    """Change of the log's own SoC, and of the counted one over the same time [%]."""
-    count_by_shape: FloatArray
-    """Change of that counted one by each shape at its bound [%], shape (k,)."""
 
     @property
     def trace(self) -> Trace:
@@ -120,15 +116,12 @@ def log_rows(
     delta = np.column_stack([coefficient_columns(of), by_shape[:, _healthy_shapes(tried)]])
     every = np.column_stack([deviations, beside, delta, by_shape, residual_v])
     table = every[kept] * np.sqrt(log.row_s)
-    change = log.own_change(of.plain.soc_pct)
     return LogRows(
         of,
         deviations.shape[1] + beside.shape[1],
         kept,
         table,
         Rows.of(table[:, :-1], table[:, -1], 1.0),
-        change,
-        np.array([0.0 if change is None else _count_by(shape, of, change[1]) for shape in tried]),
     )
 
 
@@ -142,15 +135,6 @@ def _nuisance_columns(pack: Pack, time_s: FloatArray, soc_pct: FloatArray) -> Fl
     unsettled = [0.01 * drop_v * np.exp(-time_s / tau_s) for tau_s in (150.0, 1200.0)]
     knee = np.exp(-np.clip(soc_pct, -4.0, 100.0) / 4.0)
     return np.column_stack([*unsettled, 0.0015 * pack.voltage_v * knee])
-
-
-def _count_by(shape: Shape, of: Simulated, counted_pct: float) -> float:
-    """Return the change of the counted SoC by a shape at its bound [%]."""
-    if shape.effect.fault not in ("current_reading", "capacity"):
-        return 0.0
-    changed = of.with_effect(shape.effect, shape.values(shape.about)).soc_pct
-    now = of.trace.own_change(changed)
-    return 0.0 if now is None else (counted_pct - now[1]) * shape.bound / shape.about
 
 
 def _healthy_shapes(tried: Sequence[Shape]) -> IntArray:
@@ -233,8 +217,8 @@ class Healthy:
         tables = [log.rows.table[:, log.m : log.m + self.n] for log in logs]
         return sum(float(np.sum((table @ root) ** 2)) for table in tables) / total_s(logs)
 
-    def own_soc(self, log: LogRows, soc_pct: FloatArray) -> tuple[float, float]:
-        """Return the counted less the log's own change of SoC, in standard deviations; and one [%].
+    def own_soc(self, log: LogRows, soc_pct: FloatArray) -> float:
+        """Return the counted less the log's own change of SoC, in standard deviations.
 
         The own change is scaled by `soc_ratio`. The difference is 0 where that without any effect
         does not stand out.
@@ -245,15 +229,12 @@ class Healthy:
         soc_pct : array of shape (n,)
             Counted SoC of all rows of the log, with or without an effect [%].
         """
-        change = log.trace.own_change(soc_pct)
-        if log.own_change is None or change is None:
-            return 0.0, 1.0
-        moved, counted = log.own_change
+        moved, counted = log.trace.own_change(log.simulated.plain.soc_pct)
         ratio, scatter = self.soc_ratio
         std = float(np.hypot(scatter * moved, SOC_RESOLUTION_PCT))
         if abs(counted - ratio * moved) < SOC_STANDS_OUT * std:
-            return 0.0, std
-        return (change[1] - ratio * moved) / std, std
+            return 0.0
+        return (log.trace.own_change(soc_pct)[1] - ratio * moved) / std
 
 
 def total_s(logs: Sequence[LogRows]) -> float:
@@ -380,10 +361,10 @@ def _flatter(covariance: FloatArray, scale: float) -> FloatArray:
 
 def _soc_ratio(logs: Sequence[LogRows]) -> tuple[float, float]:
     """Return mean and scatter of counted charge over the change of the references' own SoC."""
-    changes = [log.own_change for log in logs if log.own_change is not None]
-    if not changes:
+    changes = [log.trace.own_change(log.simulated.plain.soc_pct) for log in logs]
+    moved, counted = np.array([change for change in changes if change[0]]).reshape(-1, 2).T
+    if not moved.size:
         return 1.0, SOC_SCATTER
-    moved, counted = np.array(changes).T
     weight = moved**2 / ((SOC_SCATTER * moved) ** 2 + SOC_RESOLUTION_PCT**2)
     ratio = float(weight @ (counted / moved) / weight.sum())
     scatter2 = float(weight @ (counted / moved - ratio) ** 2 / weight.sum())

@@ -55,14 +55,14 @@ class Trace:
     rows: IntArray
     row_s: float
 
-    def own_change(self, soc_pct: FloatArray) -> tuple[float, float] | None:
+    def own_change(self, soc_pct: FloatArray) -> tuple[float, float]:
         """Return the change of the log's own SoC, and that of a counted one over the same time [%].
 
-        Between its highest and its lowest value; None where it has none that changes.
+        Between its highest and its lowest value; 0 where it has none.
         """
         own = self.log.soc_pct
-        if own is None or np.isfinite(own).sum() < 2:
-            return None
+        if own is None or not np.isfinite(own).any():
+            return 0.0, 0.0
         first, last = sorted((int(np.nanargmax(own)), int(np.nanargmin(own))))
         return float(own[last] - own[first]), float(soc_pct[last] - soc_pct[first])
 

@@ -105,7 +105,7 @@ class SizeProfile:
                 for each in (size, beyond)
             )
         volts, volts_there = here.residual_v[log.kept], there.residual_v[log.kept]
-        soc, soc_there = (self._healthy.own_soc(log, each.soc_pct)[0] for each in (here, there))
+        soc, soc_there = (self._healthy.own_soc(log, each.soc_pct) for each in (here, there))
         slope = np.column_stack([(volts - volts_there) / change, volts])
         return slope, np.array([(soc - soc_there) / change, soc])
 
