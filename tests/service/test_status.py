@@ -300,23 +300,59 @@ def test_a_runtime_folder_that_another_user_has_made_is_not_used(
     server.close()
 
 
-@pytest.mark.parametrize("answer", [b"", b'{"schema": 99}'])
+class Answers:
+    """A foreign server at a unix socket: sends one answer, all of it or byte by byte."""
+
+    def __init__(self, path: Path, answer: bytes, every_s: float = 0.0) -> None:
+        self._answer, self._every_s = answer, every_s
+        self._server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._server.bind(str(path))
+        self._server.listen()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.join()
+        self._server.close()
+
+    def _serve(self) -> None:
+        peer, _ = self._server.accept()
+        with peer, suppress(OSError):  # the client has gone
+            if not self._every_s:
+                peer.sendall(self._answer)
+            for place in range(len(self._answer) if self._every_s else 0):
+                peer.sendall(self._answer[place : place + 1])
+                time.sleep(self._every_s)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"",
+        b'{"schema": 99}',
+        b"[" * 500_000,
+        b'{"schema": 1}',
+        b'{"schema": 1, "estimate": {}, "sample": 5, "reasons": 3, "frames": null}',
+        b'{"schema": 1, "x": ' + b"9" * 100_000 + b"}",
+    ],
+)
 def test_an_answer_that_is_no_status(tmp_path: Path, answer: bytes) -> None:
-    path = tmp_path / "x.sock"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
-        server.bind(str(path))
-        server.listen()
+    with Answers(tmp_path / "x.sock", answer):
+        ended = in_process("status", "--endpoint", tmp_path / "x.sock")
+    assert (ended.code, ended.out) == (1, "")
+    assert "x.sock: the answer is not a status" in ended.err
 
-        def serve() -> None:
-            peer, _ = server.accept()
-            with peer:
-                peer.sendall(answer)
 
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with pytest.raises(CangaugeError, match="not a status"):
-            fetch_status(path)
-        thread.join()
+def test_an_answer_without_end_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cangauge.service.status_client.ANSWER_WITHIN_S", 0.2)
+    with (
+        Answers(tmp_path / "x.sock", b"{" * 1000, every_s=0.01),
+        pytest.raises(NotRunningError, match="timed out"),
+    ):
+        fetch_status(tmp_path / "x.sock")
 
 
 def test_a_socket_survives_a_lack_of_descriptors(

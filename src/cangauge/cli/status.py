@@ -69,11 +69,21 @@ def status_command(
 
     `cangauge status --endpoint /run/cangauge/can0/socketcan-can0.sock --json`
     """
-    from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
+    from cangauge.service.status_client import (
+        NotRunningError,
+        fetch_status,
+        find_socket,
+        no_status,
+    )
 
     def ask() -> tuple[str, dict[str, Any]]:
         place = endpoint or find_socket()
-        return f"cangauge at {place}", fetch_status(place)
+        status = fetch_status(place)
+        try:
+            live_text(status), status_values(status)
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise no_status(place) from error
+        return f"cangauge at {place}", status
 
     if watch:
         _watch(ask)

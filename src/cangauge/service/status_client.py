@@ -50,7 +50,7 @@ BOUNDS_S: Final = (
 )
 """Upper bounds of the buckets of a histogram [s]; one more bucket holds larger values."""
 ANSWER_WITHIN_S: Final = 3.0
-"""Longest wait for a part of the answer [s]."""
+"""Longest wait for an answer [s]."""
 LARGEST_ANSWER: Final = 1 << 20
 SEND_WITHIN_S: Final = 0.5
 """Longest wait for a client that does not read [s]; the next one waits as long."""
@@ -235,11 +235,12 @@ def fetch_status(path: Path) -> dict[str, Any]:
     CangaugeError
         If the answer is not a status.
     """
-    answer = b""
+    answer, until_s = b"", time.monotonic() + ANSWER_WITHIN_S
     try:
         with _connected(path) as connection:
             while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
                 answer += part
+                connection.settimeout(max(until_s - time.monotonic(), 1e-3))
     except OSError as error:
         has_ended = isinstance(error, (ConnectionRefusedError, FileNotFoundError))
         kind = EndedError if has_ended else NotRunningError
@@ -248,9 +249,14 @@ def fetch_status(path: Path) -> dict[str, Any]:
         content = json.loads(answer)
         if content["schema"] == SCHEMA:
             return cast("dict[str, Any]", content)
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         pass
-    raise CangaugeError(f"{path}: the answer is not a status of this release of cangauge")
+    raise no_status(path)
+
+
+def no_status(path: Path) -> CangaugeError:
+    """Return the error for an answer that is no status."""
+    return CangaugeError(f"{path}: the answer is not a status of this release of cangauge")
 
 
 def _connected(path: Path) -> socket.socket:
