@@ -72,7 +72,7 @@ class Life:
 
 
 def clean(text: str) -> bool:
-    return "Traceback" not in text and "ERROR" not in text
+    return "Traceback" not in text and "duplicate_sender" not in text
 
 
 def write_state(path: Path, address: BusAddress, seed: int) -> None:

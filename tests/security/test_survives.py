@@ -176,9 +176,16 @@ def test_a_wrong_clock_makes_no_valid_soc_of_an_old_state(off_s: float, tmp_path
             assert again.latest.soc_pct == pytest.approx(saved, abs=1.0)
 
 
-def test_a_reached_memory_limit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), ImportError("libarrow.so: failed to map segment from shared object")],
+    ids=["memory", "library"],
+)
+def test_a_reached_memory_limit_is_one_line(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def exhausted(**_: object) -> None:
-        raise MemoryError
+        raise error
 
     monkeypatch.setattr("cangauge.cli.app.app", exhausted)
     ended = in_process("status")

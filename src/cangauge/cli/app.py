@@ -149,10 +149,12 @@ def main() -> None:
         # Files are written elsewhere: this is stdout, into a file on a full disk.
         _discard_stdout()
         sys.exit(_failed(f"stdout: {error.strerror}", {}, 1))
-    except MemoryError:
-        problem, cure = "the memory limit is reached", "raise it (ulimit -v, MemoryMax=)"
-        sys.exit(_failed(f"{problem}; {cure}", CangaugeError(problem).to_dict(), 1))
-    except Exception as error:  # a bug: Python prints the traceback and exits with 1
+    except Exception as error:
+        # Of a library that is loaded: the words of the C library's loader.
+        if isinstance(error, MemoryError) or "failed to map segment" in str(error):
+            problem, cure = "the memory limit is reached", "raise it (ulimit -v, MemoryMax=)"
+            sys.exit(_failed(f"{problem}; {cure}", CangaugeError(problem).to_dict(), 1))
+        # A bug: Python prints the traceback and exits with 1.
         _failed("", CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise
     if code == 130:  # typer's code for Ctrl-C
