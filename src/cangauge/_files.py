@@ -118,20 +118,36 @@ def read_beginning(file: io.BufferedReader, size: int) -> bytes:
 
 def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the rest of an open file; raise InputError if it has more than `limit` bytes."""
-    data = file.read(min(limit + 1, _PIECE_BYTES))
-    if len(data) == _PIECE_BYTES:  # else it is whole, and is not copied
-        pieces = [data]
-        while sum(map(len, pieces)) <= limit and (piece := file.read(_PIECE_BYTES)):
+    pieces, size = list[bytes](), _stated_bytes(file, path)
+    if size <= limit:
+        size = 0
+        while size <= limit and (piece := file.read(min(limit + 1, _PIECE_BYTES))):
             pieces.append(piece)
-        data = b"".join(pieces)
-    if len(data) > limit:
-        size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
-        raise InputError(
-            f"larger than the {size} that {what} may have",
-            source=path,
-            cure="check that this is the right file, or split it",
-        )
-    return data
+            size += len(piece)
+    if size > limit:
+        raise _too_large(path, limit, what)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+def _stated_bytes(file: BinaryIO, path: str | PathLike[str]) -> int:
+    """Return the size that an open file states, unpacked; 0 if it states none."""
+    if type(file) not in {io.BufferedReader, gzip.GzipFile}:
+        return 0
+    size = os.fstat(file.fileno()).st_size
+    if isinstance(file, gzip.GzipFile):
+        with Path(path).open("rb") as packed:
+            packed.seek(-min(size, 4), io.SEEK_END)
+            stated = int.from_bytes(packed.read(4), "little")
+        # What packs better is quickly unpacked; and a cut file ends in any number.
+        size = stated if stated <= 30 * size else 0
+    return size
+
+
+def _too_large(path: str | PathLike[str], limit: int, what: str) -> InputError:
+    size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
+    problem = f"larger than the {size} that {what} may have"
+    cure = "check that this is the right file, or split it"
+    return InputError(problem, source=path, cure=cure)
 
 
 def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
@@ -238,6 +254,8 @@ class Head:
                     return
                 member = _only_member(archive, self.path)
                 self.name = _stem(Path(member.filename).name)
+                if member.file_size > MAX_LOG_BYTES:
+                    raise _too_large(self.path, MAX_LOG_BYTES, "a log")
                 with archive.open(member) as content:
                     yield cast("io.BufferedReader", content)
         except _DAMAGE as error:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import os
 import struct
 import time
 import tracemalloc
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -80,6 +82,7 @@ FILES: dict[str, bytes] = {
     "multiplexers": nested_multiplexers(),
     "attributes": b'VERSION ""\nBU_: E\n' + b'BA_DEF_ BO_ "A" INT 0 1;\n' * 150_000,
     "a large container": packed_container(1 << 30),
+    "blank lines": b"\n" * (1 << 26),
     "packed twice": gzip.compress(gzip.compress(LOG)),
     "a packed table": gzip.compress(wide("c{}")),
 }
@@ -143,6 +146,59 @@ def test_a_link_to_itself_is_refused(reader: str, tmp_path: Path) -> None:
     path.symlink_to(path)
     with pytest.raises(InputError, match="cannot be read: Too many levels"):
         READERS[reader](path)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_pipe_is_refused_and_not_waited_for(reader: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "file")
+    with pytest.raises(InputError, match=r"this is a pipe \(FIFO\), not a file"):
+        READERS[reader](tmp_path / "file")
+
+
+def stated_by_gzip(path: Path) -> None:
+    """Write 40 MB in gzip, whose end states 1.1 GB."""
+    packed = gzip.compress(LOG + b"1,1,1,1\n" * (5 * MIB), compresslevel=0)
+    path.write_bytes(packed[:-4] + (1100 * MIB).to_bytes(4, "little"))
+
+
+def stated_by_zip(path: Path) -> None:
+    """Write a zip whose directory states 1.1 GB."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("log.csv", LOG)
+    size, stated = len(LOG).to_bytes(4, "little"), (1100 * MIB).to_bytes(4, "little")
+    path.write_bytes(path.read_bytes().replace(size + size, size + stated))
+
+
+def stated_by_the_file_system(path: Path) -> None:
+    path.write_bytes(LOG)
+    os.truncate(path, 1100 * MIB)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [stated_by_gzip, stated_by_zip, stated_by_the_file_system],
+    ids=lambda each: each.__name__,
+)
+def test_a_log_that_states_its_size_is_refused_unread(
+    tmp_path: Path, write: Callable[[Path], None]
+) -> None:
+    write(tmp_path / "file")
+    began_s = time.process_time()
+    assert "larger than the 1024 MB that a log may have" in refusal(a_log, tmp_path / "file")
+    assert time.process_time() - began_s < 0.5
+
+
+def test_a_log_that_grows_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{k},{k % 3},380,20\n" for k in range(30)]
+    head = "time_s,current_a,voltage_v,temperature_c\n"
+    path.write_text(head + "".join(rows[:20]))
+    opened = open_log(path)
+    with path.open("a") as logger:
+        logger.write("".join(rows[20:]) + "30,1")
+    log = opened.read()
+    assert len(log) == 30
+    assert "the last line is cut off and was omitted: the file may be incomplete" in log.remarks
 
 
 def test_a_command_refuses_a_link_to_itself(tmp_path: Path) -> None:

@@ -39,6 +39,9 @@ MAX_STAMP_S: Final = 1e11
 """Largest time stamp of a frame [s]: the year 5138, counted from 1970."""
 HEAD_LINES: Final = 400
 """First lines, by which a text format is recognised."""
+IDLE_LINES: Final = 1_000_000
+"""A text with more lines than this in a row that state no frame is refused: reading them takes a
+second."""
 FEW_MALFORMED: Final = 100
 """A file with more malformed lines than this, and than frames, is refused at once."""
 PERIODS_S: Final = (1.0, 60.0, 3600.0, 2.0**32 / 1e6, 86400.0)
@@ -200,6 +203,17 @@ class CaptureReader(MessageReader, ABC):
             problem = f"the {self.name} file is damaged ({self.damage})"
             raise InputError(problem, source=self.source, cure="record or fetch it again")
 
+    def bounded(self, lines: Iterator[str]) -> Iterator[str]:
+        """Yield lines; raise InputError where `IDLE_LINES` in a row state no frame."""
+        frames = idle = 0
+        for line in lines:
+            idle = idle + 1 if frames == self.frames else 0
+            frames = self.frames
+            if idle > IDLE_LINES:
+                problem = f"{IDLE_LINES} lines in a row state no frame of {self.name}"
+                raise InputError(problem, source=self.source, cure="record or export it again")
+            yield line
+
     def skip(self, line: int | None) -> None:
         """Count a malformed line or frame; raise InputError if there are many."""
         self.malformed += 1
@@ -321,7 +335,7 @@ class LineReader(CaptureReader, TextIOMessageReader):
 
     def read(self) -> Iterator[can.Message]:
         """Yield the frames of the lines."""
-        lines = self.lines()
+        lines = self.bounded(self.lines())
         head = list(islice(lines, HEAD_LINES))
         if head and not self.prepare(head):
             raise InputError(f"the file is not a {self.name}", source=self.source)

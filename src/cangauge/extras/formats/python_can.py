@@ -65,7 +65,7 @@ class LibraryReader(CaptureReader, BinaryIOMessageReader):
 
     def _of_text(self) -> Iterator[can.Message]:
         """Yield the frames; python-can stops at a malformed line, and is begun again after it."""
-        lines, head = self.lines(), list[str]()
+        lines, head = self.bounded(self.lines()), list[str]()
         for line in lines:
             if not line.startswith(self.comment):
                 lines = chain([line], lines)
