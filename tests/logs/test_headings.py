@@ -7,7 +7,6 @@ import pytest
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.headings import meaning_of
-from cangauge.logs.proposals import proposing
 
 SPELLINGS = {
     "Arbin": (
@@ -112,7 +111,7 @@ def test_several_of_a_kind_are_left_to_the_user() -> None:
     choice = choose_columns(headings)
     assert set(choice.chosen) == {"time"}
     unknown = UnknownColumnsError("x.csv", headings, choice, None)
-    error = str(proposing(unknown, lambda _: True))
+    error = str(unknown.proposing(lambda _: True))
     assert "--columns 'time=Time [s],current=?,voltage=?'" in error
     assert error.endswith("; current is #2 or #3; voltage is Voltage 1 or Voltage 2")
 

@@ -273,7 +273,7 @@ class ReadingOptions:
         recording, car = self.open(path), None
         if isinstance(recording, LogFile):
             self.note_log(path)
-            recording = replace(recording, used=tuple(used))
+            recording = replace(recording, read_besides=tuple(used))
         else:
             car = self.car_of(path)
         log = log_of(recording, car, temperature_c=self.temperature)

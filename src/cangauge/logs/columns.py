@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import repeat
+from itertools import islice, product, repeat
 from typing import Final
 
 from cangauge.errors import InputError, closest
@@ -61,9 +61,10 @@ class Choice:
 
 
 class UnknownColumnsError(InputError):
-    """A table whose columns are not plain, with the likely ones of each quantity.
+    """A table whose columns are not plain.
 
-    `likely` are texts as a user would state them, `stated` those that the user states.
+    `likely` are the columns that each quantity may have, as texts of `--columns`: the user's, the
+    chosen one, or guesses.
     """
 
     def __init__(
@@ -73,29 +74,68 @@ class UnknownColumnsError(InputError):
         missing = " and ".join(filter(None, (", ".join(needed[:-1]), *needed[-1:])))
         problem = f"no plain heading of {missing} (found: {shown_headings(headings)})"
         super().__init__(problem, source=source, cure=f"name the columns with --columns ({DOCS})")
-        self.stated = {} if given is None else dict(given.texts)
-        self.likely = _likely(headings, choice)
+        self.likely: dict[str, list[str]] = {}
+        for quantity in FIELDS:
+            others: Sequence[_Found] = choice.guesses.get(quantity, ())
+            texts = list[str]()
+            if quantity in choice.chosen:
+                column = choice.chosen[quantity]
+                texts = ["+".join(_text_of(headings, place) for place in column.places)]
+                others = column.others
+            texts += [_text_of(headings, *each) for each in others]
+            if given is not None and quantity in given.texts:
+                texts = [given.texts[quantity]]
+            if texts:
+                self.likely[quantity] = texts
+
+    def proposing(self, can_read: Callable[[ColumnMap], bool]) -> InputError:
+        """Return the error with the columns to paste, if any columns read the file.
+
+        A quantity of which several columns do has a `?`, and so has one without a likely column.
+
+        Parameters
+        ----------
+        can_read : callable
+            Whether columns read the file.
+        """
+        proposed = self.likely
+        if set(NEEDED) <= set(proposed):
+            # Without temperature and SoC, if one of them is not read.
+            needed = {name: self.likely[name] for name in NEEDED}
+            proposed = _that_read(self.likely, can_read) or _that_read(needed, can_read)
+            if not proposed:
+                return self
+        texts, several = [], []
+        for name in FIELDS:
+            found = proposed.get(name, [])
+            if len(found) == 1 or (found and name == "time"):
+                texts.append(f"{name}={found[0]}")
+            elif found or name in NEEDED:
+                texts.append(f"{name}=?")
+            if len(found) > 1 and name != "time":
+                several.append(f"{name} is {' or '.join(found)}")
+        columns = ",".join(texts).replace("'", "'\\''")
+        cure = "; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several])
+        return InputError(self.problem, source=self.source, cure=cure)
 
 
-def _likely(headings: Sequence[str], choice: Choice) -> dict[str, list[str]]:
-    """Return the likely columns of each quantity, as texts of `--columns`."""
+def _text_of(headings: Sequence[str], place: int, meaning: Meaning | None = None) -> str:
+    """Return a column as a user would name it: by number where its heading stands twice."""
+    text = headings[place] if headings.count(headings[place]) == 1 else f"#{place + 1}"
+    unit = "" if meaning is None else meaning.unit
+    return text if unit in {"", names_and_units(headings[place])[0][1]} else f"{text}[{unit}]"
 
-    def text_of(place: int, meaning: Meaning | None = None) -> str:
-        text = headings[place] if headings.count(headings[place]) == 1 else f"#{place + 1}"
-        unit = "" if meaning is None else meaning.unit
-        return text if unit in {"", names_and_units(headings[place])[0][1]} else f"{text}[{unit}]"
 
-    likely = {}
-    for quantity in FIELDS:
-        found: list[str] = []
-        if quantity in choice.chosen:
-            column = choice.chosen[quantity]
-            found.append("+".join(text_of(place) for place in column.places))
-            found += [text_of(place, meaning) for place, meaning in column.others]
-        found += [text_of(place, meaning) for place, meaning in choice.guesses.get(quantity, ())]
-        if found:
-            likely[quantity] = found
-    return likely
+def _that_read(
+    likely: dict[str, list[str]], can_read: Callable[[ColumnMap], bool]
+) -> dict[str, list[str]]:
+    """Return the columns of the combinations that read the file; {} if none does."""
+    choices = [likely[name] if name in NEEDED else likely[name][:1] for name in likely]
+    trials = (dict(zip(likely, each, strict=True)) for each in product(*choices))
+    # At most 24, as each reads the beginning of the file.
+    read = [trial for trial in islice(trials, 24) if can_read(ColumnMap(trial))]
+    found = {name: [*dict.fromkeys(trial[name] for trial in read)] for name in likely}
+    return found if read else {}
 
 
 def choose_columns(
@@ -111,26 +151,29 @@ def choose_columns(
     if given is None and are_canonical(headings):
         return _canonical(headings)
     units = [*units_below, *repeat("", len(headings))]
-    meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
-    choice = Choice()
-    stated = ColumnMap() if given is None else given
+    meanings = [*map(meaning_of, headings, units)]
+    choice, stated = Choice(), given or ColumnMap()
     for quantity in stated.texts:
         column = _given_column(quantity, stated, headings, meanings)
-        _refuse_taken(column, quantity, choice, stated)
+        for other, chosen in choice.chosen.items():
+            if not set(column.places).isdisjoint(chosen.places):
+                cure = "give each quantity a column of its own, as headings or as #1, #2, …"
+                raise stated.error(quantity, f"is the column of {other} too", cure)
         choice.chosen[quantity] = column
     taken = {place for column in choice.chosen.values() for place in column.places}
-    for quantity in FIELDS:
-        if quantity in stated.texts:
-            continue
-        found = [
-            (place, meaning)
-            for place, meaning in enumerate(meanings)
-            if meaning is not None and meaning.quantity == quantity and place not in taken
-        ]
-        found.sort(key=lambda item: item[1].rank)
-        if found:
-            _choose(quantity, found, headings, choice)
+    found: dict[str, list[_Found]] = {quantity: [] for quantity in FIELDS}
+    for place, meaning in enumerate(meanings):
+        if meaning is not None and place not in taken and meaning.quantity not in choice.chosen:
+            found[meaning.quantity].append((place, meaning))
+    for quantity, columns in found.items():
+        columns.sort(key=_rank)
+        if columns:
+            _choose(quantity, columns, headings, choice)
     return choice
+
+
+def _rank(found: _Found) -> Rank:
+    return found[1].rank
 
 
 def _canonical(headings: Sequence[str]) -> Choice:
@@ -186,39 +229,38 @@ def _choose(
     quantity: str, found: Sequence[_Found], headings: Sequence[str], choice: Choice
 ) -> None:
     """Choose among the columns of a quantity, the most direct of which is first; or guess."""
-    place, first = found[0]
+    _, first = found[0]
+    best = [item for item in found if item[1].rank == first.rank]
+    is_sure = len(best) == 1
+    most = min(first.rank, Rank.GUESS)
+    if quantity == "time":
+        best, is_sure = best[:1], True
+    elif quantity == "temperature":
+        best = _probes(best)
+        is_sure = len(best) == 1 or all(meaning.numbered for _, meaning in best)
+    elif quantity != "soc" and first.numbered:  # one of several that differ by their numbers
+        numbered = [meaning.numbered for _, meaning in found if meaning.rank <= Rank.GUESS]
+        if sum(numbered) > 1:
+            is_sure, most = False, Rank.GUESS
     pair = _directions(headings, found) if quantity == "current" else None
-    best = _best(quantity, found)
-    are_siblings = _are_siblings(quantity, found)
     if pair is not None:
         choice.chosen[quantity] = pair
-    elif first.rank >= Rank.GUESS or are_siblings or not best:
-        rank = Rank.GUESS if are_siblings else min(first.rank, Rank.GUESS)
-        choice.guesses[quantity] = [item for item in found if item[1].rank <= rank]
-    elif quantity == "time":
-        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=tuple(found[1:]))
-    else:
+    elif is_sure and first.rank < Rank.GUESS:
         places = tuple(place for place, _ in best)
-        meaning = best[0][1]
-        choice.chosen[quantity] = ChosenColumn(places, meaning.unit, source=meaning.source)
+        others = tuple(found[1:]) if quantity == "time" else ()
+        _, meaning = best[0]
+        choice.chosen[quantity] = ChosenColumn(
+            places, meaning.unit, source=meaning.source, others=others
+        )
+    else:
+        choice.guesses[quantity] = [item for item in found if item[1].rank <= most]
 
 
-def _best(quantity: str, found: Sequence[_Found]) -> list[_Found]:
-    """Return the most direct columns, none where several compete for one quantity."""
-    first = found[0][1]
-    best = [item for item in found if item[1].rank == first.rank]
-    if quantity == "temperature" and len(best) > 1:  # of one unit, °C first; T beside T1, T2 is it
-        celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
-        best = celsius or [item for item in best if item[1].unit == first.unit]
-        best = [item for item in best if not item[1].numbered] or best
-    are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
-    return best if len(best) == 1 or are_probes or quantity == "time" else []
-
-
-def _are_siblings(quantity: str, found: Sequence[_Found]) -> bool:
-    """Return whether the most direct column is one of several that differ by their numbers."""
-    numbered = [meaning.numbered for _, meaning in found if meaning.rank <= Rank.GUESS]
-    return quantity in {"current", "voltage"} and found[0][1].numbered and sum(numbered) > 1
+def _probes(best: list[_Found]) -> list[_Found]:
+    """Return the temperatures of one unit, °C first; T beside T1, T2 is it."""
+    celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
+    best = celsius or [item for item in best if item[1].unit == best[0][1].unit]
+    return [item for item in best if not item[1].numbered] or best
 
 
 def _directions(headings: Sequence[str], found: Sequence[_Found]) -> ChosenColumn | None:
@@ -255,21 +297,17 @@ def _given_column(
             problem = f"the headings have different units: {shown}"
             raise given.error(quantity, problem, "name columns of one unit")
         unit = units[0] if len(units) == 1 else ""
-        unit = unit if stated is None else stated
         first = meanings[places[0]] if quantity == "temperature" else None
-        source = first.source if first is not None else "unknown"
-        is_stated = stated is not None or factor != 1.0
-        return ChosenColumn(places, unit, factor, source, is_stated)
+        return ChosenColumn(
+            places,
+            unit if stated is None else stated,
+            factor,
+            source="unknown" if first is None else first.source,
+            is_stated=stated is not None or factor != 1.0,
+        )
     near = closest(given.texts[quantity], headings)
     problem = f"no column has this heading (found: {shown_headings(headings)})"
     raise given.error(quantity, problem, f"did you mean {near}?" if near else SYNTAX)
-
-
-def _refuse_taken(column: ChosenColumn, quantity: str, choice: Choice, given: ColumnMap) -> None:
-    for other, chosen in choice.chosen.items():
-        if not set(column.places).isdisjoint(chosen.places):
-            cure = "give each quantity a column of its own, as headings or as #1, #2, …"
-            raise given.error(quantity, f"is the column of {other} too", cure)
 
 
 def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:

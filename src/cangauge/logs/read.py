@@ -22,7 +22,6 @@ from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
-from cangauge.logs.proposals import proposing
 from cangauge.logs.quantities import FIELDS
 from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
@@ -116,15 +115,15 @@ class CellColumns:
 class LogFile:
     """A file that may be a log, recognised by its beginning.
 
-    `reader` is None if it is not a log. `columns` and `sign` are the user's; `used` are columns
-    that the caller reads besides.
+    `reader` is None if it is not a log. `columns` and `sign` are the user's; `read_besides` are
+    headings that the caller reads itself, so that they are not ignored.
     """
 
     head: Head
     reader: LogReader | None
     columns: ColumnMap | None = None
     sign: Sign | None = None
-    used: tuple[str, ...] = ()
+    read_besides: tuple[str, ...] = ()
 
     @property
     def is_any_table(self) -> bool:
@@ -145,24 +144,24 @@ class LogFile:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
         try:
             draft = reader.read(self.head, self.columns)
-            draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
+            draft.ignored = tuple(name for name in draft.ignored if name not in self.read_besides)
             log = draft.log(temperature_c, temperature_source, self.sign)
         except UnknownColumnsError as error:
-            raise proposing(error, partial(self.reads, reader)) from error
+            raise error.proposing(partial(self.can_read, reader)) from error
         except MemoryError as error:
             problem, cure = "larger than the free memory", "split it"
             raise InputError(problem, source=self.head.path, cure=cure) from error
         pa.default_memory_pool().release_unused()
         return log
 
-    def reads(self, reader: LogReader, columns: ColumnMap) -> bool:
+    def can_read(self, reader: LogReader, columns: ColumnMap) -> bool:
         """Return whether a reader makes a log of the file's beginning by these columns."""
-        head, whole_lines = self.head, self.head.data.rpartition(b"\n")[:2]
-        head = head.holding(b"".join(whole_lines)) if head.lines else head
+        head = self.head
+        if head.lines:
+            head = head.holding(head.data[: head.data.rfind(b"\n") + 1])
         constant_c = None if "temperature" in columns.texts else 20.0
         try:
-            draft = reader.read(head, columns)
-            return len(draft.log(constant_c, None, self.sign)) > 1
+            return len(reader.read(head, columns).log(constant_c, None, self.sign)) > 1
         except InputError:
             return False
 
@@ -198,33 +197,35 @@ class LogFile:
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
-    head = file.head
+    head, field, value = file.head, None, None
     foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
-    if foreign is not None:
-        return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
     headings, choice = likely_header(head)
-    is_of_frames = len(_FRAME_WORDS.intersection(text.strip().lower() for text in headings)) > 1
-    if len(headings) >= 3 and not is_of_frames:
-        unknown = UnknownColumnsError(str(head.path), headings, choice, None)
-        error = proposing(unknown, partial(file.reads, LogTableReader()))
-        return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     bare = without_header(head)
-    if bare is not None and not headings:
+    rows = [line.split() for line in head.lines[1:5]]
+    shown = head.first_line.strip()
+    if foreign is not None:
+        kind, cure = foreign
+        problem = f"{problem}: it is {kind}"
+    elif len(headings) > 2 and len(_FRAME_WORDS.intersection(map(_simple, headings))) < 2:
+        unknown = UnknownColumnsError(str(head.path), headings, choice, None)
+        error = unknown.proposing(partial(file.can_read, LogTableReader()))
+        problem, cure = f"{problem}: {error.problem}", error.cure or ""
+    elif bare is not None and not headings:
         problem, count = f"{problem}: a table without a header", len(bare.headings)
         named = ",".join(f"{name}=#{k}" for k, name in enumerate([*FIELDS][:count], start=1))
         cure = f"name its {count} columns by number, such as --columns '{named}' ({DOCS})"
-        return InputError(problem, source=head.path, cure=cure)
-    rows = [line.split() for line in head.lines[1:5]]
-    if rows and all(len(row) > 2 and all(map(is_number, row)) for row in rows):
+    elif rows and all(len(row) > 2 and all(map(is_number, row)) for row in rows):
+        problem = f"{problem}: its columns are separated by blanks"
         cure = "separate them by commas: sed -E 's/^ +//; s/ +/,/g' FILE > log.csv"
-        return InputError(
-            f"{problem}: its columns are separated by blanks", source=head.path, cure=cure
-        )
-    shown = head.first_line.strip()
-    is_text = bool(shown) and shown.isprintable()
-    field, value = ("first line", shown[:80]) if is_text else (None, None)
-    cure += f"; other tables: --columns ({DOCS})"
+    else:
+        cure += f"; other tables: --columns ({DOCS})"
+        if shown and shown.isprintable():
+            field, value = "first line", shown[:80]
     return InputError(problem, source=head.path, field=field, value=value, cure=cure)
+
+
+def _simple(heading: str) -> str:
+    return heading.strip().lower()
 
 
 def open_log(
@@ -268,12 +269,12 @@ def log_of_dataframe(
         raise InputError("not a log", value=type(frame).__name__, cure=cure) from error
     indices = [column for column in table.schema if column.name.startswith("__index_level_")]
     times = [column.name for column in indices if pa.types.is_timestamp(column.type)]
-    if len(times) == 1 and not {"time", "time_s"} & {n.lower() for n in table.column_names}:
+    if len(times) == 1 and {"time", "time_s"}.isdisjoint(map(_simple, table.column_names)):
         table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
-    columns_of = table_of_schema(table.schema, table.select, name)
-    draft = draft_of_table(columns_of, given, name=name, source="")
+    source = table_of_schema(table.schema, table.select, name)
+    draft = draft_of_table(source, given, name=name, source="")
     return draft.log(temperature_c, temperature_source, sign)
 
 
