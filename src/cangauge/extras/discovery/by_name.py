@@ -27,7 +27,6 @@ from cangauge.bus.dbc_text import EXTENDED
 from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate
 from cangauge.extras.discovery.fields import LEAST_BITS
-from cangauge.extras.discovery.pairs import FEW_MOVES
 from cangauge.logs.quantities import unit_of
 from cangauge.logs.sign import correlation
 
@@ -351,7 +350,7 @@ def _followed(current: _NamedSignal, voltage: _NamedSignal) -> float:
     near = np.diff(common) == 1.0
     amps, volts = (np.diff(mean[at])[near] for mean, at in zip(means, rows, strict=True))
     moves = float((amps**2).sum() ** 2 / max(float((amps**4).sum()), 1e-12))
-    if moves < FEW_MOVES:
+    if moves < 4.0:  # one coincidence, such as the wake-up, may be all
         return 0.0
     share = correlation(amps, volts) ** 2
     return max(1.0 - (1.0 - share) * (moves - 1.0) / (moves - 2.0), 0.0)

@@ -26,13 +26,13 @@ from cangauge.extras.discovery.candidate import (
     Level,
     is_capacity,
 )
-from cangauge.extras.discovery.fields import Field, collect, fields_of, most_common
+from cangauge.extras.discovery.fields import Extent, Field, collect, fields_of
 from cangauge.extras.discovery.pairs import (
     IMPOSSIBLE,
     LARGEST_R2,
     Grid,
-    Pairs,
     Row,
+    best_pairs,
     round_zeros,
 )
 from cangauge.extras.discovery.proposal import Proposal
@@ -138,7 +138,7 @@ def _pair(
     fields: Sequence[Field], grid: Grid, nominal_v: float | None
 ) -> tuple[list[Candidate], list[Candidate], Row | None]:
     """Return the candidates for current and voltage, and the field of the first current."""
-    currents = [row for field in fields if (row := _as_current(field))]
+    currents = [_as_current(field) for field in fields]
     voltages = [row for field in fields if (row := _as_voltage(field, nominal_v))]
     if not currents or not voltages:
         return [], [], None
@@ -146,7 +146,7 @@ def _pair(
     # likelier fields.
     currents = sorted(currents, key=attrgetter("prior"), reverse=True)[:4000]
     voltages = sorted(voltages, key=attrgetter("prior"), reverse=True)[:1500]
-    return Pairs(voltages, currents, grid).best()
+    return best_pairs(voltages, currents, grid)
 
 
 def _socs(
@@ -170,30 +170,18 @@ def _socs(
     return kept[:SHOWN]
 
 
-def _as_current(field: Field) -> Row | None:
-    """Return a field as a current; None where it has too few values."""
+def _as_current(field: Field) -> Row:
+    """Return a field as a current."""
     place, nature, constant = field.best
-    is_signed, full = place.is_signed, 1 << place.width
-    if len(np.unique(field.values)) < 3 and not is_signed:
-        return None
     prior = nature + field.prior
-    low, high = (float(end + constant) for end in (field.values.min(), field.values.max()))
-    if is_signed and low < 0.0 <= high:
-        # A measured current at rest hovers around zero, …
-        prior += 1.0 if max(-low, high) < full >> 2 else 0.0
-    elif not is_signed and low >= 0.9 * full:
-        # Nearly all ones: a small negative number.
-        place, constant = replace(place, is_signed=True), constant - full
-    elif not is_signed:
-        # … which an unsigned field holds as a round number.
-        zeros = round_zeros(low, high, place.width)
-        resting = most_common(field.values) + constant
-        rest = min((abs(each - resting) for each in zeros), default=math.inf)
-        if any(each and math.log2(each).is_integer() for each in zeros):
-            prior += 1.0
-        # A pack's current has two signs: a number from zero upwards is none.
-        prior -= 5.0 if not any(zeros) else 1.0 if rest > 0.15 * (high - low) else 0.0
-    return Row(field, place, constant, field.missing, prior)
+    if not place.is_signed:
+        low, high = (float(end + constant) for end in (field.values.min(), field.values.max()))
+        if low >= 0.9 * (1 << place.width):  # nearly all ones: a small negative number
+            place, constant = replace(place, is_signed=True), constant - (1 << place.width)
+        elif not any(round_zeros(low, high, place.width)):
+            # A pack's current has two signs: an unsigned field holds zero as a round number.
+            prior -= 5.0
+    return Row(field, Extent(place, nature, constant), field.missing, prior)
 
 
 def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
@@ -202,33 +190,31 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
         return None
     zero = (field.raw == 0) & ~field.missing
     readings: list[Row] = []
-    for place, nature, constant in field.extents:
+    for extent in field.extents:
         # Zero: before the contactors close.
-        missing = field.missing | zero if constant == 0 else field.missing
+        missing = field.missing | zero if extent.constant == 0 else field.missing
         good = field.raw[~missing]
         if len(good) < 0.3 * len(field.raw):
             continue
-        low, level, high = np.percentile(good, [2.0, 50.0, 98.0]) + constant
-        if low <= 0.0 or (high - low) / level > 0.5:
+        low, level, high = np.percentile(good, [2.0, 50.0, 98.0]) + extent.constant
+        if low <= 0.0 or high - low > 0.5 * level:
             continue
-        if level > 0.95 * (1 << place.width):
-            continue  # nearly all ones: a small negative number
         # What rests at half its range is a torque, a yaw rate or the like with an offset; a voltage
         # is there by chance once in twenty or thirty.
-        at_half = abs(level / (1 << (place.width - 1)) - 1.0) < 0.03
-        prior = nature + field.prior - 3.0 * at_half
+        width = extent.place.width
+        at_half = abs(level / (1 << (width - 1)) - 1.0) < 0.03
+        prior = extent.nature + field.prior - 3.0 * at_half
         for scale in VOLTAGE_SCALES:
             volts = level * scale
-            likely = prior + _scale_prior(scale, volts, place.width, nominal_v)
-            text = f"{volts:.3g} V at {scale:g} V a step of {place.width} bits"
+            text = f"{volts:.3g} V at {scale:g} V a step of {width} bits"
             text += f" (about {round(volts / 3.7)} cells)"
-            meant = Level(scale, volts, text)
-            readings.append(Row(field, place, constant, missing, likely, meant))
+            likely = prior + _scale_prior(scale, volts, width, nominal_v)
+            readings.append(Row(field, extent, missing, likely, (Level(scale, volts, text),)))
     return _likeliest(readings, by_scale=nominal_v is None)
 
 
 def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
-    """Return the likeliest reading, with the others that fit as well.
+    """Return the likeliest reading, with the levels of the others that fit as well.
 
     Bits and physics are the same by every scale; where that is decided, other bits of the field may
     fit as well.
@@ -237,14 +223,15 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
     if best is None or best.prior < IMPOSSIBLE / 2.0:
         return None
     least = IMPOSSIBLE / 2.0 if by_scale else best.prior - 5.0
+    (own,) = best.levels
     others = [
-        each.level
+        each.levels[0]
         for each in readings
         if each.prior > least
-        and abs(each.level.value / best.level.value - 1.0) > 0.01
-        and (each.place == best.place or not by_scale)
+        and abs(each.levels[0].value / own.value - 1.0) > 0.01
+        and (each.extent is best.extent or not by_scale)
     ]
-    best.levels = (best.level, *sorted(others)) if others else ()
+    best.levels = (own, *sorted(others))
     return best
 
 
@@ -260,30 +247,34 @@ def _as_charge(
     r = correlation(values, drawn_ah)
     if r > -0.95:
         return None
+    # It moves no further than the charge: noise below it, or bits in a wrong order, would.
+    way, charge_way = (float(np.abs(np.diff(each)).sum()) for each in (values, drawn_ah))
+    if way * moved > 2.0 * charge_way * spread:
+        return None
     evidence = -0.5 * distinct * math.log(1.0 - min(r * r, LARGEST_R2))
     readings: list[Row] = []
-    for place, nature, constant in field.extents:
+    for extent in field.extents:
         for scale in SOC_SCALES:
-            low, high = (scale * (end + constant) for end in (values.min(), values.max()))
+            low, high = (scale * (end + extent.constant) for end in (values.min(), values.max()))
             capacity_ah = 100.0 * moved / (spread * scale)
-            if low > 0.0 and high <= 101.0 and is_capacity(capacity_ah):
-                score = evidence + nature - 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
-                score -= 0.5 if (1 << place.width) * scale > 300.0 and scale > 0.02 else 0.0
+            if low > 0.0 and high <= 101.0 and is_capacity(capacity_ah) and capacity_ah > least_ah:
+                score = evidence + extent.nature
+                score -= 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
                 text = f"{low:.3g} … {high:.3g} % at {scale:g} % a step ({capacity_ah:.0f} Ah)"
                 meant = Level(scale, high, text)
-                readings.append(Row(field, place, constant, field.missing, score, meant))
+                readings.append(Row(field, extent, field.missing, score, (meant,)))
     row = _likeliest(readings, by_scale=True)
-    capacity_ah = 100.0 * moved / (spread * row.level.scale) if row else 0.0
-    if row is None or capacity_ah < least_ah:
+    if row is None:
         return None
+    scale = row.levels[0].scale
     return row.candidate(
         "soc_reference",
-        row.level.scale,
+        scale,
         0.0,
         score=row.prior,
         evidence=evidence,
         correlation=r,
-        partner=f"{capacity_ah:.0f} Ah per 100 %",
+        partner=f"{100.0 * moved / (spread * scale):.0f} Ah per 100 %",
     )
 
 
