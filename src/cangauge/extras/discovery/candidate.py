@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from cangauge.extras.discovery.fields import Place, Stream
+if TYPE_CHECKING:
+    from cangauge.extras.discovery.fields import Place, Stream
 
 MOST_A: Final = 1500.0
 """Largest current of a pack [A]: the fastest cars draw 1,500 A."""
@@ -41,6 +42,11 @@ ROLES: Final = {
     "soc_reference": Role("soc_pct", "%", (0.0, 100.0), "soc stateofcharge ladezustand"),
     "temperature": Role("temperature_c", "°C", (-30.0, 60.0), "temperature temperatur temp temps"),
 }
+
+
+def short_name(role: str) -> str:
+    """Return a role as a user names it."""
+    return role.removesuffix("_reference")
 
 
 class Level(NamedTuple):

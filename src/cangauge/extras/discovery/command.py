@@ -15,6 +15,13 @@ from cangauge._files import check_writable, make_folder, write_texts_atomic
 from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import CangaugeError, InputError
+from cangauge.extras.discovery.candidate import (
+    LEAST_HOURS,
+    ROLES,
+    is_capacity,
+    range_text,
+    short_name,
+)
 
 if TYPE_CHECKING:
     import can
@@ -22,16 +29,6 @@ if TYPE_CHECKING:
     from cangauge.extras.discovery.proposal import Proposal
     from cangauge.logs.log import Log
 
-_ROLES: Final = {
-    "current": "current",
-    "voltage": "voltage",
-    "soc": "soc_reference",
-    "temperature": "temperature",
-}
-"""Roles by their names on the command line."""
-_NEEDED: Final = ("current", "voltage")
-_SOC_AGREES: Final = 0.1
-"""Largest relative difference of the capacities that SoC and charge have by two halves."""
 _BUS: Final = ("interface", "channel", "bus_options")
 _SCALE_CURES: Final = {
     "voltage": ("voltage", "Give --nominal-voltage V (by a meter; a type plate is less sure)."),
@@ -110,7 +107,7 @@ def init_command(
             cure = "give a capture, --interface and --channel, or --dbc FILE"
             raise InputError("nothing to look at", field="CAPTURE", cure=cure)
         proposal = _find(paths, dbc, nominal_voltage, presets=presets)
-        unclear = _choose(proposal, picks)
+        unclear = [] if proposal.vehicle else _choose(proposal, picks)
         if unclear or (proposal.method == "physics" and not proposal.has_steps):
             raise _undecided(proposal, unclear, nominal_voltage, output, quiet=json_output)
         _prove(proposal, paths, output, bus, folder)
@@ -124,13 +121,14 @@ def init_command(
 
 def _picks(given: Sequence[str]) -> dict[str, int]:
     """Return the number of the candidate by role, from 0."""
+    of_name = {short_name(role): role for role in ROLES}
     picks = {}
     for text in given:
-        role, _, number = text.partition("=")
-        if role not in _ROLES or number not in {*"123456789"}:
-            cure = f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2"
+        name, _, number = text.partition("=")
+        if name not in of_name or number not in {*"123456789"}:
+            cure = f"ROLE is {', '.join(of_name)}; N counts from 1: --choose current=2"
             raise InputError("not ROLE=N", field="--choose", value=text, cure=cure)
-        picks[_ROLES[role]] = int(number) - 1
+        picks[of_name[name]] = int(number) - 1
     return picks
 
 
@@ -138,10 +136,9 @@ def _check(output: Path, *, force: bool) -> None:
     """Raise InputError if a file exists in the folder, or cannot be written."""
     try:
         existing = next(folder for folder in (output, *output.parents) if folder.exists())
-        is_folder = existing.is_dir()
     except OSError as error:  # too long a name
         raise InputError("cannot create this folder", source=output) from error
-    if not is_folder:
+    if not existing.is_dir():
         raise InputError(f"cannot create this folder: {existing} is a file", source=output)
     for name in ("car.toml", "run.toml", "car.dbc"):
         if (output / name).is_file() and not force:
@@ -232,21 +229,15 @@ def _known(paths: Sequence[Path]) -> str | None:
 
 def _choose(proposal: Proposal, picks: Mapping[str, int]) -> list[str]:
     """Choose a candidate for each role: the user's, or the clear one; return unclear roles."""
-    if proposal.method == "preset":
-        return []
-    unclear = []
-    for name, role in _ROLES.items():
-        count = len(proposal.candidates.get(role, ()))
-        if role in picks:
-            if picks[role] >= count:
-                value = f"{name}={picks[role] + 1}"
-                raise InputError(f"there are {count} candidates", field="--choose", value=value)
-            proposal.chosen[role] = picks[role]
-        elif role in proposal.clear:
-            proposal.chosen[role] = 0
-        elif role in _NEEDED:
-            unclear.append(role)
-    return unclear
+    for role, found in proposal.candidates.items():
+        number = picks.get(role, 0)
+        if number >= len(found) and role in picks:
+            value = f"{short_name(role)}={number + 1}"
+            problem = f"there are {len(found)} candidates"
+            raise InputError(problem, field="--choose", value=value)
+        if role in picks or role in proposal.clear:
+            proposal.chosen[role] = number
+    return [role for role in ("current", "voltage") if role not in proposal.chosen]
 
 
 def _undecided(
@@ -258,27 +249,27 @@ def _undecided(
     quiet: bool,
 ) -> CangaugeError:
     """Return the error of a map that cannot be made; print the candidates, if not `quiet`."""
-    absent = [role for role in unclear if not proposal.candidates[role]]
-    problem = f"no {' and no '.join(unclear)} is clearly the pack's"
-    cure = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
-    if absent:
-        problem = f"nothing can be the {' or the '.join(absent)}"
-        cure = "record a drive"
-        if proposal.method == "dbc":
-            cure = "give the DBC that has it, or name the signals in a map file (docs/map-file.md)"
-    elif not proposal.has_steps:
-        cure = f"record a drive, or {cure}"
-    if proposal.method == "physics" and not proposal.has_steps:
+    by_physics = proposal.method == "physics"
+    cure = "record a drive"
+    if by_physics and not proposal.has_steps:
         problem = "no voltage follows a current in steps, so that nothing proves the signals"
-        cure = "record a drive"
-    elif proposal.method == "physics" and nominal_v is None:
-        problem += ", and the scale of the voltage is open (--nominal-voltage V decides it)"
-    if not quiet:
+    elif absent := [role for role in unclear if not proposal.candidates[role]]:
+        problem = f"nothing can be the {' or the '.join(absent)}"
+        if not by_physics:
+            cure = "give the DBC that has it, or name the signals in a map file (docs/map-file.md)"
+    else:
+        problem = f"no {' and no '.join(unclear)} is clearly the pack's"
+        choice = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
+        cure = choice if proposal.has_steps else f"{cure}, or {choice}"
+        if by_physics and nominal_v is None:
+            problem += ", and the scale of the voltage is open (--nominal-voltage V decides it)"
+    if quiet:
+        for role in unclear:
+            names = [f"{n}) {c.name}" for n, c in enumerate(proposal.candidates[role], 1)]
+            problem += f"; {role}: {', '.join(names)}"
+    else:
         say(f"No map: {problem}.")
         _show_candidates(proposal)
-    for role in unclear if quiet else ():
-        names = [f"{n}) {c.name}" for n, c in enumerate(proposal.candidates[role], 1)]
-        problem += f"; {role}: {', '.join(names)}"
     return CangaugeError(f"{problem}; nothing was written to {output}: {cure}")
 
 
@@ -330,24 +321,26 @@ def _prove(
 
 def _soc_by_charge(log: Log, sign: int) -> dict[str, Any]:
     """Return the capacity that SoC and charge have by each half [Ah], and whether they agree."""
-    from cangauge.extras.discovery.candidate import LEAST_HOURS, is_capacity
     from cangauge.logs.charge import implied_capacity
 
     if log.first_soc() is None:
         return {}
-    middle = len(log) // 2
+    middle, most = len(log) // 2, 0.1  # largest relative difference
     parts = log.rows(slice(None, middle)), log.rows(slice(middle, None))
     try:
-        first, second = (implied_capacity([part], 0.0) for part in parts)
+        halves = [implied_capacity([part], 0.0) for part in parts]
     except InputError:
         return {"agrees": False, "why": "it does not move, so that no charge proves it"}
-    halves_ah = sorted(sign * half.capacity_ah for half in (first, second))
-    std_ah = max(first.std_ah, second.std_ah)
-    least_ah = max(LEAST_HOURS * float(abs(log.current_a).max()), std_ah / _SOC_AGREES)
-    agrees = halves_ah[0] >= least_ah and all(map(is_capacity, halves_ah))
-    agrees &= halves_ah[1] <= (1.0 + _SOC_AGREES) * halves_ah[0]
-    why = f"by charge, 100 % are {halves_ah[0]:.3g} … {halves_ah[1]:.3g} Ah"
-    return {"agrees": bool(agrees), "why": f"{why} in the halves of the capture"}
+    low_ah, high_ah = sorted(sign * half.capacity_ah for half in halves)
+    agrees = (
+        is_capacity(low_ah)
+        and is_capacity(high_ah)
+        and low_ah >= LEAST_HOURS * float(abs(log.current_a).max())
+        and low_ah * most >= max(half.std_ah for half in halves)
+        and high_ah <= (1.0 + most) * low_ah
+    )
+    why = f"by charge, 100 % are {low_ah:.3g} … {high_ah:.3g} Ah in the halves of the capture"
+    return {"agrees": agrees, "why": why}
 
 
 def _show_candidates(proposal: Proposal) -> None:
@@ -360,15 +353,13 @@ def _show_candidates(proposal: Proposal) -> None:
                 mark += " ?" if proposal.is_open(role) else " ✓"
             rows.append([mark, *candidate.cells])
         if candidates:
-            print_table(role.replace("_reference", ""), ["", *candidates[0].head], rows)
+            print_table(short_name(role), ["", *candidates[0].head], rows)
     for remark in proposal.remarks:
         note(f"note: {remark}")
 
 
 def _show(proposal: Proposal, files: Sequence[str], output: Path) -> None:
     """Print the candidates, what the capture proves, what is assumed, and the next commands."""
-    from cangauge.extras.discovery.candidate import range_text
-
     say(f"{proposal.answer}: wrote {', '.join(files)}.")
     _show_candidates(proposal)
     if proof := proposal.proof:

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 from cangauge._text import printable
 from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.vehicle import PRESETS
-from cangauge.extras.discovery.candidate import ROLES, Candidate, Level
+from cangauge.extras.discovery.candidate import ROLES, Candidate, Level, short_name
 
 FALLBACK_C: Final = 20.0
 """Temperature of a map without one [°C]: the reference temperature of the voltage model."""
@@ -81,7 +81,7 @@ class Proposal:
         if self.vehicle is not None:
             return f"{PRESETS[self.vehicle].about} (--vehicle {self.vehicle})"
         found = [
-            f"{role.removesuffix('_reference')} {signal.name}{' (?)' * self.is_open(role)}"
+            f"{short_name(role)} {signal.name}{' (?)' * self.is_open(role)}"
             for role, signal in self.signals.items()
         ]
         way = "names" if self.method == "dbc" else "physics"
