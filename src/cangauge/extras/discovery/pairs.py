@@ -213,6 +213,8 @@ class _Moves:
         padded = np.pad(level, ((0, 0), (width // 2 + 1, width - width // 2 - 1)), mode="edge")
         sums = np.cumsum(padded, axis=1)
         free = level - (sums[:, width:] - sums[:, :-width]) / width
+        bound = 5.0 * np.sqrt((free**2).mean(1, keepdims=True))
+        free = np.clip(free, -bound, bound)
         free -= free.mean(1, keepdims=True)
         std = free.std(1)
         group = max(1, round(MOVE_S / step_s))
@@ -253,8 +255,9 @@ def best_pairs(
     )
     r = _product(u.values, i.values)
     slope = np.abs(r) * u.std[:, None] / np.maximum(i.std, 1e-9)
-    likely, amps = _scales(u, i, slope)
-    evidence = np.where(likely > IMPOSSIBLE / 2.0, _evidence(u, i, r, slope, grid.step_s), 0.0)
+    evidence = _evidence(u, i, r, slope, grid.step_s)
+    likely, amps = _scales(u, i, slope, evidence >= 1.0)
+    evidence = np.where(likely > IMPOSSIBLE / 2.0, evidence, 0.0)
     score = (
         evidence
         + _polarisation(u, i, r, grid.step_s)
@@ -273,13 +276,17 @@ def best_pairs(
     score[is_copy | sags] = IMPOSSIBLE
     found: tuple[list[Candidate], list[Candidate]] = ([], [])
     chosen: Row | None = None
+    bits: tuple[set[Any], set[Any]] = (set(), set())
     for place in np.argsort(-score, axis=None)[: 200 * 200].tolist():
         a, b = divmod(place, len(currents))
         voltage, current = voltages[a], currents[b]
         if score[a, b] < IMPOSSIBLE / 2.0 or min(map(len, found)) >= SHOWN:
             break
-        if voltage.bits & current.bits:
+        # A field of a better pair keeps its role.
+        if voltage.bits & (current.bits | bits[0]) or current.bits & bits[1]:
             continue
+        bits[0].update(current.bits)
+        bits[1].update(voltage.bits)
         chosen = chosen or current
         scale_a, scale_v = float(amps[a, b]), voltage.levels[0].scale
         facts = {
@@ -305,14 +312,19 @@ def _streams(of: _Moves) -> Ints:
     return np.array([id(row.field.stream) for row in of.rows])
 
 
-def _scales(u: _Moves, i: _Moves, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the log prior of each pair's resistance, and the current's scale [A] that gives it."""
+def _scales(
+    u: _Moves, i: _Moves, slope: FloatArray, is_known: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the log prior of each pair's resistance, and the current's scale [A] that gives it.
+
+    Where the slope is not known it is chance, and constrains neither.
+    """
     volts = np.array([row.levels[0].scale for row in u.rows])[:, None]
     full = 2.0 ** (np.array([row.extent.place.width for row in i.rows]) - 1)
     away = np.array([row.away for row in i.rows])
     likely, best = np.full(slope.shape, IMPOSSIBLE), np.ones(slope.shape)
     for amps, usual in CURRENT_SCALES.items():
-        ohm = slope * volts / amps
+        ohm = np.where(is_known, slope * volts / amps, 0.12)
         # From 12 V starter packs to old car packs.
         prior = usual - 0.5 * (np.log(np.maximum(ohm, 1e-12) / 0.12) / 1.2) ** 2
         # Cars reach 100–1000 A.
@@ -342,7 +354,9 @@ def _evidence(u: _Moves, i: _Moves, r: FloatArray, slope: FloatArray, step_s: fl
     u_step = np.array([row.step for row in u.rows])[:, None]
     i_step = slope * np.array([row.step for row in i.rows])
     alike = (i_step > u_step / 3.5) & (i_step < u_step * 3.5)
-    evidence[alike & (lost < 0.15 * (u_step**2 + i_step**2))] = 0.0
+    is_rounded = alike & (lost < 0.15 * (u_step**2 + i_step**2))
+    # In many moves a voltage shows its polarisation: what follows closer is the same quantity.
+    evidence[is_rounded | ((r**2 > 0.9985) & (count > 20.0))] = 0.0
     # Loads are correlated (torque, power): from 20 nats on further samples count half.
     return np.asarray(20.0 * np.log1p(evidence / 20.0))
 

@@ -138,7 +138,7 @@ def _pair(
     fields: Sequence[Field], grid: Grid, nominal_v: float | None
 ) -> tuple[list[Candidate], list[Candidate], Row | None]:
     """Return the candidates for current and voltage, and the field of the first current."""
-    currents = [_as_current(field) for field in fields]
+    currents = [row for field in fields if (row := _as_current(field))]
     voltages = [row for field in fields if (row := _as_voltage(field, nominal_v))]
     if not currents or not voltages:
         return [], [], None
@@ -170,11 +170,13 @@ def _socs(
     return kept[:SHOWN]
 
 
-def _as_current(field: Field) -> Row:
-    """Return a field as a current."""
+def _as_current(field: Field) -> Row | None:
+    """Return a field as a current; None where it has too few values."""
     place, nature, constant = field.best
     prior = nature + field.prior
     if not place.is_signed:
+        if len(np.unique(field.values)) < 3:
+            return None
         low, high = (float(end + constant) for end in (field.values.min(), field.values.max()))
         if low >= 0.9 * (1 << place.width):  # nearly all ones: a small negative number
             place, constant = replace(place, is_signed=True), constant - (1 << place.width)
