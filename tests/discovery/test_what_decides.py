@@ -199,3 +199,13 @@ def test_a_soc_is_ticked_where_it_agrees_with_the_charge(
     assert done.code == 0, done.err
     assert mark in done.out.partition("soc")[2].replace("  ", " ")
     assert "SoC: " in done.err
+
+
+def test_a_soc_moves_no_further_than_the_charge() -> None:
+    amps = load(1)
+    soc = raw(90.0 - 100.0 * np.cumsum(amps) * 0.1 / 3600.0 / 10.0, 0.5)
+    noise = np.random.default_rng(5).integers(0, 256, len(amps))
+    words = [raw(amps, 0.1, -500.0), raw(370.0 - 0.1 * amps, 0.1)]
+    found = search(frames({0x100: words, 0x102: [256 * soc + noise]}))
+    first, *_ = found.candidates["soc_reference"]
+    assert first.bits == {(0x102, False, bit) for bit in range(8, 16)}
