@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.bus.protection import FrameChecker, ProtectionRule, Verdict
+from cangauge.bus.protection import FrameChecker, ProtectionRule
 
 
 def test_a_counter_from_0_to_14_turns_without_a_loss() -> None:
@@ -12,11 +12,11 @@ def test_a_counter_from_0_to_14_turns_without_a_loss() -> None:
     checker = FrameChecker(rule, 0.01)
     sent = [rule.protect(bytearray(8), n) for n in range(45)]
     verdicts = [checker.check(data, 0.01 * n) for n, data in enumerate(sent)]
-    assert set(verdicts) == {Verdict.GOOD}
+    assert set(verdicts) == {None}
     del sent[20]  # this one is a loss
     checker = FrameChecker(rule, 0.01)
     found = [checker.check(data, 0.01 * n) for n, data in enumerate(sent)]
-    assert found.count(Verdict.AFTER_LOSS) == 1
+    assert found.count("counter_jumps") == 1
     impossible = ProtectionRule(polynomial=0x1D).protect(bytearray(8), 15)
     assert not rule.is_whole(impossible)
 

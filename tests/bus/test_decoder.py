@@ -80,9 +80,9 @@ def test_damaged_and_short_frames_are_refused_and_counted() -> None:
     assert last is not None
     assert [*found, last.current_a] == [0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 9.0]
     fate = decoder.statistics.messages[CURRENT_ID]
-    assert (fate.crc_errors, fate.short) == (1, 1)
+    assert (fate["crc_errors"], fate["short"]) == (1, 1)
     # The short one counts as lost for the alive counter; the damaged one does not.
-    assert (fate.counter_jumps, fate.frames_lost) == (1, 1)
+    assert (fate["counter_jumps"], fate["frames_lost"]) == (1, 1)
 
 
 def test_repeated_frames_are_refused_and_longer_ones_cut() -> None:

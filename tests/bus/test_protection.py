@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import crccheck.crc
 import pytest
@@ -13,17 +14,20 @@ from hypothesis import strategies as st
 from cangauge.bus.database import BitField
 from cangauge.bus.protection import (
     RULES,
+    Anomaly,
     CounterRule,
     E2eRule,
     FrameChecker,
     Protection,
     ProtectionRule,
-    Verdict,
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 
-GOOD, LOSS, WRONG, REPEATED = Verdict
+GOOD: None = None
+LOSS: Final = "counter_jumps"
+WRONG: Final = "crc_errors"
+REPEATED: Final = "counter_repeats"
 IDS = tuple(range(0x40, 0x50))
 TRIED: dict[str, Protection] = {
     "leaf": RULES["leaf"],
@@ -138,7 +142,9 @@ def test_published_check_values() -> None:
             assert TRIED[name].is_whole(data) is (counter == 14)
 
 
-def checked(rule: Protection, period_s: float | None, *frames: tuple[float, int]) -> list[Verdict]:
+def checked(
+    rule: Protection, period_s: float | None, *frames: tuple[float, int]
+) -> list[Anomaly | None]:
     checker = FrameChecker(rule, period_s)
     return [checker.check(rule.protect(bytes(24), n), time_s) for time_s, n in frames]
 
@@ -265,4 +271,4 @@ def test_losses_beyond_a_turn_of_the_counter_are_counted_by_the_stamps(missing: 
 def test_a_slower_sender_than_stated_loses_nothing() -> None:
     checker = FrameChecker(TRIED["leaf"], period_s=0.01)
     for number in range(50):
-        assert checker.check(TRIED["leaf"].protect(bytes(8), number), 0.1 * number) is Verdict.GOOD
+        assert checker.check(TRIED["leaf"].protect(bytes(8), number), 0.1 * number) is GOOD

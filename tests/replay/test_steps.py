@@ -129,7 +129,7 @@ def test_each_frame_of_a_reply_gets_the_clock(tmp_path: Path) -> None:
         step.frames[0].timestamp = clock_s
         live.handle(step.frames[0])
         assert step.is_wanted is (step.frames[0].arbitration_id != 0x123)
-    assert sum(each.wanted for each in live.statistics.messages.values()) == 40
+    assert sum(each["wanted"] for each in live.statistics.messages.values()) == 40
     assert live.health["temperature"].latest == 20.0
 
 

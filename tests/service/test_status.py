@@ -126,8 +126,8 @@ def test_a_snapshot_grows_old_and_stale(watched: Watched) -> None:
 def test_refused_frames_are_counted_by_reason(watched: Watched) -> None:
     messages = watched.pipeline.decoder.statistics.messages.values()
     for counters in messages:
-        counters.crc_errors += 2
-        counters.not_available += 1
+        counters["crc_errors"] += 2
+        counters["not_available"] += 1
     watched.turn()
     assert watched.status["rejects"]["crc_errors"] == 2 * len(messages)
     frames = watched.status["frames"]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from functools import partial
+from typing import Final, cast, get_args
 
 import can
 import numpy as np
@@ -17,13 +18,13 @@ from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
 from cangauge.bus.mapping import CellsMap
 from cangauge.bus.plausibility import (
-    MessageStatistics,
+    Count,
     PackProperties,
     SignalHealth,
     StuckDetector,
     stuck_detectors,
 )
-from cangauge.bus.protection import FrameChecker, Verdict
+from cangauge.bus.protection import FrameChecker
 from cangauge.bus.vehicle import Vehicle, VehicleSignal, pgn_mask
 from cangauge.types import Reason, Sample
 
@@ -33,7 +34,7 @@ _MISSING: Final = {
     "temperature": Reason.TEMPERATURE_MISSING,
 }
 # Looked up for every frame or sample; enum members are slow to look up.
-_DUPLICATE, _NO_REASON, _GOOD = Reason.DUPLICATE_SENDER, Reason.NONE, Verdict.GOOD
+_DUPLICATE, _NO_REASON = Reason.DUPLICATE_SENDER, Reason.NONE
 
 SUSPECTED_FOR_S: Final = 10.0
 """Time after the last sign of a second sender for which a message is refused [s]: longer than an
@@ -42,17 +43,17 @@ attacker's pause between two tries, well below the longest gap over which charge
 
 @dataclass(slots=True)
 class FrameStatistics:
-    """Statistics of all frames; totals of `MessageStatistics` under the same names."""
+    """Counts of all frames; those of its messages have their total under the same names."""
 
-    messages: dict[int, MessageStatistics] = field(default_factory=dict)  # by key, see `vehicle`
+    messages: dict[int, Counter[Count]] = field(default_factory=dict)  # by key, see `vehicle`
     frames: int = 0  # received, wanted or not
     samples: int = 0
 
     def __getattr__(self, name: str) -> int:
-        """Return the total of a statistic of the messages."""
-        if name not in MessageStatistics.__dataclass_fields__:
+        """Return the total of a count of the messages."""
+        if name not in get_args(Count):
             raise AttributeError(name)
-        return sum(getattr(each, name) for each in self.messages.values())
+        return sum(each[cast("Count", name)] for each in self.messages.values())
 
 
 class Pairing:
@@ -143,73 +144,63 @@ class CellVoltages:
 
 
 @dataclass(slots=True)
-class _Route:
+class _Wanted:
     """A wanted message: its checks, its signals, and place and codec of the cells in it."""
 
     name: str
     length: int
     checker: FrameChecker | None
-    statistics: MessageStatistics
+    counts: Counter[Count]
+    by_pgn: bool
     inputs: list[tuple[SignalCodec, SignalHealth]] = field(default_factory=list)
     cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
     last_s: float = -math.inf
     suspected_s: float = -math.inf  # the last sign of a second sender
-    by_pgn: bool = False
     source: int = -1  # latest source address (J1939), and when it was seen
     source_s: float = -math.inf
 
-    def _note_source(self, address: int, time_s: float) -> None:
-        """Suspect two senders where two source addresses send the PGN: two packs, for instance."""
-        if address != self.source:
-            if abs(time_s - self.source_s) < SUSPECTED_FOR_S:
-                self.suspected_s = time_s
-            self.source = address
-        self.source_s = time_s
-
-    def accept(self, payload: bytearray, time_s: float, source: int) -> bytearray | None:
+    def checked(self, payload: bytearray, time_s: float, source: int) -> bytearray | None:
         """Return the payload, cut to the message's length; None for a refused frame.
 
-        `source` is the source address of a J1939 frame.
+        A refused frame is a failure of each signal. `source` is the source address of a J1939
+        frame: two of them, of two packs for instance, are two senders.
         """
-        statistics, checker = self.statistics, self.checker
-        statistics.wanted += 1
+        self.counts["wanted"] += 1
         if self.by_pgn:
-            self._note_source(source, time_s)
-        if len(payload) < self.length:
-            statistics.short += 1
-            self._refuse(Reason.PROTECTION_FAILED)
-            return None
+            if source != self.source and abs(time_s - self.source_s) < SUSPECTED_FOR_S:
+                self.suspected_s = time_s
+            self.source, self.source_s = source, time_s
         if len(payload) > self.length:
             payload = payload[: self.length]
-        verdict = _GOOD if checker is None else checker.check(payload, time_s)
-        if verdict is not _GOOD and checker is not None:
-            if verdict is Verdict.CRC_WRONG:
-                statistics.crc_errors += 1
-                self._refuse(Reason.PROTECTION_FAILED)
-                return None
+        refusal = self._refusal(payload, time_s)
+        if refusal is None:
+            self.last_s = time_s
+            return payload
+        self.counts[refusal] += 1
+        reason = _DUPLICATE if refusal == "two_senders" else Reason.PROTECTION_FAILED
+        for _, health in self.inputs:
+            health.fail(reason, is_repeated=refusal == "counter_repeats")
+        return None
+
+    def _refusal(self, payload: bytearray, time_s: float) -> Count | None:
+        """Return the count of refused frames that a payload enters; None for a good one."""
+        if len(payload) < self.length:
+            return "short"
+        checker = self.checker
+        if checker is not None and (anomaly := checker.check(payload, time_s)) is not None:
+            if anomaly == "crc_errors":
+                return anomaly
             if checker.suspects_second_sender:
                 self.suspected_s = time_s
-            if verdict is Verdict.REPEATED:
-                statistics.counter_repeats += 1
-                self._refuse(Reason.PROTECTION_FAILED, is_repeated=True)
-                return None
-            statistics.counter_jumps += 1
-            statistics.frames_lost += checker.lost
-        if self.is_suspected(time_s):
-            statistics.two_senders += 1
-            self._refuse(_DUPLICATE)
-            return None
-        self.last_s = time_s
-        return payload
+            if anomaly == "counter_repeats":
+                return anomaly
+            self.counts["counter_jumps"] += 1
+            self.counts["frames_lost"] += checker.lost
+        return "two_senders" if self.is_suspected(time_s) else None
 
     def is_suspected(self, now_s: float) -> bool:
         """Return whether it seems to have two senders; not after the clock was set far back."""
         return abs(now_s - self.suspected_s) < SUSPECTED_FOR_S
-
-    def _refuse(self, reason: Reason, *, is_repeated: bool = False) -> None:
-        """Record a refused frame as a failure of each of its signals."""
-        for _, health in self.inputs:
-            health.fail(reason, is_repeated=is_repeated)
 
 
 def unsigned_reading(codec: SignalCodec, current_a: FloatArray) -> tuple[str, str] | None:
@@ -264,14 +255,14 @@ class SampleDecoder:
         self.vehicle = vehicle
         self.statistics = FrameStatistics() if statistics is None else statistics
         self.health: dict[str, SignalHealth] = {}
-        self.now_s = self._suspected_s = -math.inf  # the last sign of a second sender
+        self.now_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s)
         current, voltage = vehicle.current, vehicle.voltage
         has_same_conditions = current.codec.conditions == voltage.codec.conditions
         self._is_one_frame = current.key == voltage.key and has_same_conditions
         fixed_c = vehicle.fixed_temperature_c
         self._fixed_c = math.nan if fixed_c is None else fixed_c
-        self._routes: dict[int, _Route] = {}
+        self._wanted: dict[int, _Wanted] = {}
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
         self._replies = {reply_id(key): Reassembler() for key, each in messages if each.reply}
@@ -287,17 +278,17 @@ class SampleDecoder:
         if vehicle.cells_map is not None:
             self.cells = CellVoltages(vehicle.cells_map, len(vehicle.cells), vehicle.cell_index)
         for place, cell in enumerate(vehicle.cells):
-            self._route(cell).cells.append((place, cell.codec))
-        self._current, self._voltage = self.health["current"], self.health["voltage"]
-        self._latest_a: deque[float] = deque(maxlen=1000)  # 10 s of a fast message
-        self._temperature = self.health.get("temperature")
+            self._message_of(cell).cells.append((place, cell.codec))
         health = self.health
+        self._current, self._voltage = health["current"], health["voltage"]
+        self._temperature = health.get("temperature")
+        self._latest_a: deque[float] = deque(maxlen=1000)  # 10 s of a fast message
         self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
 
     def _add(
         self, signal: VehicleSignal, pack: PackProperties | None, detector: StuckDetector | None
     ) -> None:
-        route, role = self._route(signal), signal.role
+        wanted, role = self._message_of(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[role] = SignalHealth(
             signal.checks.within_pack(role, pack),
@@ -305,22 +296,25 @@ class SampleDecoder:
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
             is_cyclic=role in {"current", "voltage"},
             is_stuck=None if detector is None else detector.update,
-            statistics=route.statistics,
+            counts=wanted.counts,
         )
-        if route.checker is not None and not is_multiplexed:
-            route.checker.learned_period_s = health.learned_period_s
-        route.inputs.append((signal.codec, health))
+        if wanted.checker is not None and not is_multiplexed:
+            wanted.checker.learned_period_s = partial(getattr, health, "period_s")
+        wanted.inputs.append((signal.codec, health))
 
-    def _route(self, signal: VehicleSignal) -> _Route:
+    def _message_of(self, signal: VehicleSignal) -> _Wanted:
         key = signal.key
-        if key not in self._routes:
-            message = self.vehicle.messages[key]
-            statistics = self.statistics.messages.setdefault(key, MessageStatistics())
+        if key not in self._wanted:
+            message, counts = self.vehicle.messages[key], self.statistics.messages
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            self._routes[key] = _Route(
-                signal.message, signal.length, checker, statistics, by_pgn=message.by_pgn
+            self._wanted[key] = _Wanted(
+                signal.message,
+                signal.length,
+                checker,
+                counts.setdefault(key, Counter()),
+                message.by_pgn,
             )
-        return self._routes[key]
+        return self._wanted[key]
 
     def handle(self, message: can.Message) -> Sample | None:
         """Decode one frame; return the sample that it completes, if any."""
@@ -330,39 +324,32 @@ class SampleDecoder:
         key, time_s, data = message.arbitration_id, message.timestamp, message.data
         if message.is_extended_id:
             key |= EXTENDED
-        route = self._routes.get(key)
-        if route is None:
+        wanted = self._wanted.get(key)
+        if wanted is None:
             if self._by_pgn and key & EXTENDED:
-                route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), -1))
+                wanted = self._wanted.get(self._by_pgn.get(key & pgn_mask(key), -1))
             elif key in self._replies:
                 reply = self._replies[key].take(data, time_s)
                 if reply is not None:
                     start = reply[: 3 if reply[0] == READ_BY_IDENTIFIER else 2]
-                    route = self._routes.get(self._by_reply.get((key, start), -1))
+                    wanted = self._wanted.get(self._by_reply.get((key, start), -1))
                     data = bytearray(reply)
-            if route is None:
+            if wanted is None:
                 return None
-        if time_s < route.last_s:
-            self._rewind(route.last_s, time_s)
-        self.now_s = time_s
-        payload = route.accept(data, time_s, key & 0xFF)
-        if payload is None:
-            self._suspected_s = time_s if route.suspected_s == time_s else self._suspected_s
-            return None
-        return self._values(route, payload, time_s)
-
-    def _rewind(self, last_s: float, time_s: float) -> None:
-        """Handle time that runs backwards: a restarted log, or a clock that was set."""
-        if last_s - time_s > self.vehicle.pair_within_s:
+        if wanted.last_s - time_s > self.vehicle.pair_within_s:
+            # Time runs backwards: a restarted log, or a clock that was set.
             for health in self.health.values():
                 health.rewind(time_s)
+        self.now_s = time_s
+        payload = wanted.checked(data, time_s, key & 0xFF)
+        return None if payload is None else self._values(wanted, payload, time_s)
 
-    def _values(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
+    def _values(self, wanted: _Wanted, payload: bytearray, time_s: float) -> Sample | None:
         """Check the values of an accepted payload; return the sample that they complete."""
-        if route.cells and self.cells is not None:
-            self.cells.read(route.cells, payload, time_s)
+        if wanted.cells and self.cells is not None:
+            self.cells.read(wanted.cells, payload, time_s)
         current_a = voltage_v = math.nan
-        for codec, health in route.inputs:
+        for codec, health in wanted.inputs:
             if codec.conditions and not codec.is_in(payload):
                 continue
             decoded = codec.decode(payload)
@@ -396,7 +383,7 @@ class SampleDecoder:
 
         One without a further reason is old, never came, or is sent as "not available".
         """
-        is_suspected = abs(now_s - self._suspected_s) < SUSPECTED_FOR_S
+        is_suspected = any(each.is_suspected(now_s) for each in self._wanted.values())
         reasons = _DUPLICATE if is_suspected else _NO_REASON
         for health, missing in self._needed:
             if not health.is_usable(now_s):
@@ -420,17 +407,17 @@ class SampleDecoder:
     @property
     def two_sender_messages(self) -> tuple[str, ...]:
         """Names of the messages that seem to have two senders at present."""
-        routes = self._routes.values()
-        return tuple(route.name for route in routes if route.is_suspected(self.now_s))
+        wanted = self._wanted.values()
+        return tuple(each.name for each in wanted if each.is_suspected(self.now_s))
 
     @property
     def wrong_periods(self) -> dict[str, str]:
         """Messages that come much more often than the map or the DBC states, and what to do."""
         return {
-            route.name: f"{route.name} comes each {health.period_s:.2g} s: its stated period"
+            wanted.name: f"{wanted.name} comes each {health.period_s:.2g} s: its stated period"
             " is much longer, and is not used; period_s in the map file is in seconds"
-            for route in self._routes.values()
-            for _, health in route.inputs
+            for wanted in self._wanted.values()
+            for _, health in wanted.inputs
             if health.is_faster_than_stated
         }
 
@@ -441,15 +428,17 @@ class SampleDecoder:
         for signal in self.vehicle.signals:
             if not math.isnan(self.health[signal.role].latest_s):
                 continue
-            role, key = signal.role.removesuffix("_reference"), signal.key
-            number, wanted = signal.arbitration_id, self.statistics.messages[key].wanted
-            name, count = f"{signal.codec.name} of {signal.message} was never decoded", wanted
-            if self.vehicle.messages[key].reply and not wanted:
-                number = reply_id(key)
-                name, count = f"{signal.message} was never seen", self._replies[number].frames
-            found[role] = f"{role}: {name} in {count} frames of 0x{number:X}"
+            role, number = signal.role.removesuffix("_reference"), signal.arbitration_id
+            count = self.statistics.messages[signal.key]["wanted"]
+            what = f"{signal.codec.name} of {signal.message} was never decoded"
             if not count:
-                found[role] = f"{role}: {signal.message} was never seen: no frames of 0x{number:X}"
+                what = f"{signal.message} was never seen"
+                if self.vehicle.messages[signal.key].reply:
+                    number = reply_id(signal.key)
+                    count = self._replies[number].frames
+            found[role] = f"{role}: {what} in {count} frames of 0x{number:X}"
+            if not count:
+                found[role] = f"{role}: {what}: no frames of 0x{number:X}"
         return found
 
     @property

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 from cantools.database.can import Message
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from cangauge._config import read_toml
 from cangauge.bus.database import BitField
-from cangauge.bus.plausibility import Positive, SignalChecks
+from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import (
     PROFILES,
     RULES,
@@ -35,7 +35,7 @@ COUNTER: Final = "counter"
 
 
 class _MapTable(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class SignalMap(SignalChecks):
@@ -52,8 +52,8 @@ class SignalMap(SignalChecks):
     signal: str
     sign: Literal[1, -1] = 1
     signed: bool = False
-    scale: Positive = 1.0
-    offset: FiniteFloat = 0.0
+    scale: PositiveFloat = 1.0
+    offset: float = 0.0
     when: dict[str, int] = Field(default_factory=dict)
     not_available: tuple[int, ...] = ()
 
@@ -73,7 +73,7 @@ class TemperatureMap(SignalMap):
     """A temperature signal, or a fixed temperature where the bus has none."""
 
     signal: str = ""
-    fixed_c: Annotated[FiniteFloat, Field(ge=-60.0, le=120.0)] | None = None
+    fixed_c: Annotated[float, Field(ge=-60.0, le=120.0)] | None = None
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -97,12 +97,12 @@ class CellsMap(_MapTable):
     index: str | None = None
     signals: tuple[str, ...] = ()
     first_index: int = 0
-    scale: Positive = 1.0
-    offset: FiniteFloat = 0.0
+    scale: PositiveFloat = 1.0
+    offset: float = 0.0
     not_available: tuple[int, ...] = ()
-    lowest: FiniteFloat = 0.2
-    highest: FiniteFloat = 6.0  # below and above any lithium cell
-    timeout_s: Positive = 10.0  # large packs send a round of cells in some seconds
+    lowest: float = 0.2
+    highest: float = 6.0  # below and above any lithium cell
+    timeout_s: PositiveFloat = 10.0  # large packs send a round of cells in some seconds
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -153,7 +153,7 @@ class MessageMap(_MapTable):
     isotp: bool = False
     uds: bool = False
     request_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
-    period_s: Positive | None = None
+    period_s: PositiveFloat | None = None
     data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
     data_id_list: Annotated[tuple[Byte, ...], Field(min_length=16, max_length=16)] | None = None
     data_id_mode: DataIdMode | None = None
@@ -237,7 +237,7 @@ class VehicleMap(_MapTable):
     columns: dict[str, Any] | None = None
     cells: CellsMap | None = None
     temperature_source: TemperatureSource = "unknown"
-    pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = 0.020
+    pair_within_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.020
     messages: dict[str, MessageMap] = Field(default_factory=dict)
     rules: dict[str, ProtectionRule] = Field(default_factory=dict)
 

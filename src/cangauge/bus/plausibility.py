@@ -13,11 +13,12 @@ time, so that a live run and its recording give the same result.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from cangauge.types import (
     CURRENT_AT_MOST_A,
@@ -73,7 +74,6 @@ class PackProperties:
         return self.usual_v / max(self.resistance_ohm, self.usual_v / CURRENT_AT_MOST_A)
 
 
-Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 _Count = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -87,16 +87,16 @@ class SignalChecks(BaseModel):
     is stated.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    lowest: FiniteFloat = -math.inf
-    highest: FiniteFloat = math.inf
-    max_jump: Positive = math.inf
-    max_rate_per_s: Positive = 0.0
+    lowest: float = -math.inf
+    highest: float = math.inf
+    max_jump: PositiveFloat = math.inf
+    max_rate_per_s: PositiveFloat = 0.0
     invalid_after: _Count = 5
     valid_after: _Count = 3
-    stuck_after_s: Positive | None = None
-    timeout_s: Positive | None = None
+    stuck_after_s: PositiveFloat | None = None
+    timeout_s: PositiveFloat | None = None
 
     @model_validator(mode="after")
     def _a_range(self) -> Self:
@@ -111,32 +111,31 @@ class SignalChecks(BaseModel):
 
         Without a pack only a SoC has some.
         """
-        if role != "soc_reference" and pack is None:
-            return self
         limits = _LIMITS.get(role, {})
-        if role == "voltage" and pack is not None:
+        if pack is None:
+            limits = limits if role == "soc_reference" else {}
+        elif role == "voltage":
             low, high = VOLTAGE_WITHIN
             limits = {"lowest": low * pack.usual_v, "highest": high * pack.usual_v}
-        if role == "current" and pack is not None:
+        elif role == "current":
             limits = {"lowest": -pack.short_circuit_a, "highest": pack.short_circuit_a}
         return self.model_copy(update={**limits, **self.model_dump(exclude_unset=True)})
 
 
-@dataclass(slots=True)
-class MessageStatistics:
-    """Statistics of one wanted message: frames and values, refused ones by cause."""
-
-    wanted: int = 0  # frames with its id
-    crc_errors: int = 0  # frames refused
-    counter_repeats: int = 0  # frames refused: repeated alive counter
-    counter_jumps: int = 0  # good frames after a loss
-    frames_lost: int = 0  # frames missing according to the alive counter
-    short: int = 0  # frames refused: shorter than in the DBC
-    not_available: int = 0  # values refused: the code means "not available"
-    implausible: int = 0  # values refused: out of range, or changed too fast
-    stuck: int = 0  # values refused: the signal is stuck
-    held_back: int = 0  # good values not used yet, while the signal recovers from failures
-    two_senders: int = 0  # frames refused: two senders use the id
+Count = Literal[
+    "wanted",  # frames with its id
+    "crc_errors",  # frames refused
+    "counter_repeats",  # frames refused: repeated alive counter
+    "counter_jumps",  # good frames after a loss
+    "frames_lost",  # frames missing according to the alive counter
+    "short",  # frames refused: shorter than in the DBC
+    "not_available",  # values refused: the code means "not available"
+    "implausible",  # values refused: out of range, or changed too fast
+    "stuck",  # values refused: the signal is stuck
+    "held_back",  # good values not used yet, while the signal recovers from failures
+    "two_senders",  # frames refused: two senders use the id
+]
+"""Counts of one wanted message: frames and values, refused ones by cause."""
 
 
 # Looked up for every value; enum members are slow to look up.
@@ -150,6 +149,7 @@ class SignalHealth:
     `period_s` is the stated period of its values [s]; by default it is learned. `is_cyclic`: it is
     sent every period even when it does not change. `is_stuck` takes a value and its bus time [s];
     by default a signal that is not cyclic is stuck after a stated time, and a cyclic one never.
+    `counts` are those of its message, to continue.
 
     Attributes
     ----------
@@ -166,15 +166,15 @@ class SignalHealth:
         *,
         is_cyclic: bool = True,
         is_stuck: Callable[[float, float], bool] | None = None,
-        statistics: MessageStatistics | None = None,
+        counts: Counter[Count] | None = None,
     ) -> None:
         self._checks = checks
         # Read for every value; slow to read from a model.
         self._lowest, self._highest = checks.lowest, checks.highest
         self._max_jump, self._max_rate_per_s = checks.max_jump, checks.max_rate_per_s
-        self._stated_timeout_s = checks.timeout_s
-        self._period_s, self._is_cyclic = period_s, is_cyclic
-        self._statistics = statistics or MessageStatistics()
+        self._stated_s = math.nan if period_s is None else period_s
+        self._is_cyclic = is_cyclic
+        self._counts: Counter[Count] = Counter() if counts is None else counts
         self._is_stuck = is_stuck
         if not is_cyclic and checks.stuck_after_s is not None:  # it has no partner
             self._is_stuck = self._is_constant
@@ -190,23 +190,23 @@ class SignalHealth:
         if interval_s > 0.0:
             self._learn(interval_s)
         if value != value:  # noqa: PLR0124 - NaN; this runs for every value
-            self._statistics.not_available += 1
+            self._counts["not_available"] += 1
             return self.fail(_NO_REASON)
         most = self._max_jump
         if most < math.inf:
             most += self._max_rate_per_s * abs(time_s - self.latest_s)
         # The second is false before the first good value (NaN).
         if not self._lowest <= value <= self._highest or abs(value - self.latest) > most:
-            self._statistics.implausible += 1
+            self._counts["implausible"] += 1
             return self.fail(_IMPLAUSIBLE)
         if self._is_stuck is not None and self._is_stuck(value, time_s):
-            self._statistics.stuck += 1
+            self._counts["stuck"] += 1
             return self.fail(Reason.SIGNAL_STUCK)
         self._failures = 0
         if self.is_invalid:
             self._passes += 1
             if self._passes < self._checks.valid_after:
-                self._statistics.held_back += 1
+                self._counts["held_back"] += 1
                 return math.nan
         self.is_invalid, self.reason = False, _NO_REASON
         self.latest, self.latest_s = value, time_s
@@ -219,13 +219,11 @@ class SignalHealth:
 
     def _learn(self, interval_s: float) -> None:
         self._intervals += 1
-        learned_s = self._learned_s
         if self._intervals == 1:
             self._learned_s = interval_s
-        else:
-            # A pause counts as a few periods; frames may come in bursts of many.
-            longest_s = max(4.0 * learned_s, 10.0 * (self._period_s or 0.0))
-            self._learned_s = learned_s + (min(interval_s, longest_s) - learned_s) / 16.0
+        # A pause counts as a few periods; frames may come in bursts of many.
+        longest_s = max(4.0 * self._learned_s, 10.0 * self._stated_s)  # 2nd: may be NaN
+        self._learned_s += (min(interval_s, longest_s) - self._learned_s) / 16.0
 
     def fail(self, reason: Reason, *, is_repeated: bool = False) -> float:
         """Record a failed value or frame; return NaN. A repeated one does not stop recovery."""
@@ -259,33 +257,25 @@ class SignalHealth:
         """Whether the signal is invalid, or failed too often in a row to become valid."""
         return self.is_invalid or self._failures >= self._checks.invalid_after
 
-    def learned_period_s(self) -> float:
-        """Return `period_s`."""
-        return self.period_s
-
     @property
     def period_s(self) -> float:
         """Period of the values, stated or learned [s]; NaN while not known.
 
         A stated one that is much too long does not count: a silent bus would seem alive.
         """
-        stated_s = self._period_s
-        if self._intervals >= LEARN_FROM and (stated_s is None or self.is_faster_than_stated):
-            return self._learned_s
-        return math.nan if stated_s is None else stated_s
+        is_stated = self._stated_s <= FASTER * self._learned_s  # false for NaN
+        return self._stated_s if is_stated or self._intervals < LEARN_FROM else self._learned_s
 
     @property
     def is_faster_than_stated(self) -> bool:
         """Whether the values come much more often than a stated period says."""
-        stated_s = self._period_s
-        is_known = stated_s is not None and self._intervals >= LEARN_FROM
-        return is_known and FASTER * self._learned_s < (stated_s or 0.0)
+        return self.period_s < self._stated_s
 
     @property
     def timeout_s(self) -> float:
         """Age at which a value becomes old [s]."""
-        if self._stated_timeout_s is not None:
-            return self._stated_timeout_s
+        if self._checks.timeout_s is not None:
+            return self._checks.timeout_s
         usual_s, period_s = USUAL_TIMEOUT_S[self._is_cyclic], self.period_s
         if math.isnan(period_s):
             return usual_s

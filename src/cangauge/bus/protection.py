@@ -8,11 +8,11 @@ Communication Protection Library" and "E2E Protocol Specification".
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Final, Literal, NamedTuple
 
 from e2e import p01, p02, p04, p05, p06, p07, p11
 from pydantic import ConfigDict, Field
@@ -25,13 +25,14 @@ Byte = Annotated[int, Field(ge=0, le=255)]
 _Place = Annotated[int, Field(ge=-64, le=63)]
 
 
-@checked_dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
+@checked_dataclass(config=ConfigDict(extra="forbid"))
 class ProtectionRule:
     """CRC-8 (not reflected) over all other bytes, and a counter of `counter_bits` (0: none).
 
     `crc_byte` and `counter_byte` are places, negative ones from the end; `counter_shift` is the
     counter's lowest bit. `counter_modulus` is the number of counter values, by default all that its
-    bits can hold; AUTOSAR's counters of four bits often leave 15 out.
+    bits can hold; AUTOSAR's counters of four bits often leave 15 out. `modulus` is 0 without a
+    counter.
     """
 
     polynomial: Byte
@@ -43,8 +44,6 @@ class ProtectionRule:
     counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
     counter_modulus: Annotated[int, Field(ge=3, le=256)] | None = None
 
-    _table: bytes = field(init=False, repr=False, compare=False)
-
     def __post_init__(self) -> None:
         if self.counter_bits == 1 or self.counter_bits + self.counter_shift > 8:
             raise ValueError("counter_bits must be 0, or from 2 to 8 with counter_shift")
@@ -53,15 +52,11 @@ class ProtectionRule:
         most = 1 << self.counter_bits
         if self.counter_modulus is not None and self.counter_modulus > most:
             raise ValueError(f"counter_modulus is at most {most} with these counter_bits")
+        self.modulus = (self.counter_modulus or most) if self.counter_bits else 0
         table: Sequence[int] = range(256)
         for _ in range(8):
             table = [(v << 1 & 0xFF) ^ (self.polynomial if v & 0x80 else 0) for v in table]
-        object.__setattr__(self, "_table", bytes(table))
-
-    @property
-    def modulus(self) -> int:
-        """Number of counter values; 0 without a counter."""
-        return (self.counter_modulus or 1 << self.counter_bits) if self.counter_bits else 0
+        self._table = bytes(table)
 
     def fits(self, length: int) -> bool:
         """Return whether a payload of `length` bytes has both bytes, and they differ."""
@@ -108,7 +103,7 @@ RULES: Final = {
 """Rules that a map file can name."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class CounterRule:
     """A counter that is a signal of the DBC, with values below `modulus`; no known CRC."""
 
@@ -178,7 +173,7 @@ PROFILES: Final = {
 """By name in a map file. Profiles 4 and 7 need CAN FD, the others fit into 8 bytes."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass
 class E2eRule:
     """AUTOSAR end-to-end protection by a profile, one of `PROFILES`.
 
@@ -194,11 +189,6 @@ class E2eRule:
     data_id_mode: DataIdMode = "both"
     header_byte: int = 0
     protected_bytes: int = 0
-    _profile: Profile = field(init=False, repr=False, compare=False)
-    _place: slice = field(init=False, repr=False, compare=False)  # bytes of the counter
-    _mask: int = field(init=False, repr=False, compare=False)  # its bits in them
-    _data_id: int | bytes = field(init=False, repr=False, compare=False)
-    _arguments: dict[str, Any] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         name, profile = self.name, PROFILES[self.name]
@@ -219,28 +209,19 @@ class E2eRule:
         for where, problem in problems.items():
             if problem:
                 raise InputError(str(problem), field=where, value=getattr(self, where))
-        arguments: dict[str, Any] = {"length": protected}
+        self.modulus, self._profile, self._least = profile.modulus, profile, max(least, protected)
+        self._data_id = bytes(self.data_id_list) if self.data_id_list else self.data_id
+        self._arguments: dict[str, int] = {"length": protected}
         if bits:
-            arguments["offset"] = self.header_byte
+            self._arguments["offset"] = self.header_byte
         if profile.modes:
-            arguments["data_id_mode"] = modes[self.data_id_mode]
-        data_id = self.data_id if self.data_id_list is None else bytes(self.data_id_list)
-        mask, first = max(0x0F, profile.modulus - 1), self.header_byte + profile.counter_at
-        place = slice(first, first + (mask.bit_length() + 7) // 8)
-        object.__setattr__(self, "_profile", profile)
-        object.__setattr__(self, "_place", place)
-        object.__setattr__(self, "_mask", mask)
-        object.__setattr__(self, "_data_id", data_id)
-        object.__setattr__(self, "_arguments", arguments)
-
-    @property
-    def modulus(self) -> int:
-        """Number of counter values."""
-        return self._profile.modulus
+            self._arguments["data_id_mode"] = modes[self.data_id_mode]
+        self._mask, first = max(0x0F, profile.modulus - 1), self.header_byte + profile.counter_at
+        self._place = slice(first, first + (self._mask.bit_length() + 7) // 8)
 
     def fits(self, length: int) -> bool:
         """Return whether a payload of `length` bytes has the header and the protected bytes."""
-        return length >= max(self.header_byte + self._profile.header, self.protected_bytes)
+        return length >= self._least
 
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether header and CRC agree; the library refuses impossible counters."""
@@ -266,14 +247,9 @@ Protection = ProtectionRule | CounterRule | E2eRule
 `counter`, `protect`."""
 
 
-class Verdict(enum.IntEnum):
-    """Result of checking the CRC and the counter of a frame."""
-
-    GOOD = 0  # the expected frame
-    AFTER_LOSS = 1  # a good frame; frames before it are missing
-    CRC_WRONG = 2  # refused: damaged
-    REPEATED = 3  # refused: the counter did not change, so this is not a new frame
-
+Anomaly = Literal["crc_errors", "counter_repeats", "counter_jumps"]
+"""What a frame's CRC and counter show, by the count that it enters: it is damaged; the counter did
+not change, so that it is no new frame; or it is good, and frames before it are missing."""
 
 SILENCE_S: Final = 2.0
 """Silence after which a sender may have restarted, with any counter value [s]."""
@@ -290,10 +266,6 @@ CROWDED: Final = 1.5
 """Frames per period that are too many for one sender and its jitter: two send 2 or more."""
 RUN: Final = 64
 """Frames in sequence that show the period of their sender: others would lie between them."""
-
-
-def _unknown_period_s() -> float:
-    return math.nan
 
 
 class FrameChecker:
@@ -317,8 +289,10 @@ class FrameChecker:
     def __init__(self, rule: Protection, period_s: float | None = None) -> None:
         self._is_whole, self._counter, self._modulus = rule.is_whole, rule.counter, rule.modulus
         self._period_s = period_s
-        wrap_s = 2.0 * SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE)
-        self._half_wrap_s = wrap_s / 2
+        self.learned_period_s: Callable[[], float] = partial(float, "nan")
+        self._half_wrap_s = SILENCE_S
+        if period_s is not None:
+            self._half_wrap_s = period_s * min(rule.modulus, WIDE) / 2
         self._last, self._last_s = -1, 0.0
         self._refused = 0
         self._other = -1  # counter of the sequence that was left for the present one
@@ -331,21 +305,20 @@ class FrameChecker:
         self._surplus = 0.0
         self._run, self._run_s = 0, 0.0
         self.lost = 0
-        self.learned_period_s = _unknown_period_s
 
     @property
     def suspects_second_sender(self) -> bool:
         """Whether the latest frames came from two senders."""
         return self._of_others >= TWO_SENDERS
 
-    def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
+    def check(self, data: bytes | bytearray, time_s: float) -> Anomaly | None:
         """Check a payload of the message's own length, received at bus time `time_s` [s]."""
         modulus, last = self._modulus, self._last
         if not self._is_whole(data):
             self._refused += 1
-            return Verdict.CRC_WRONG
+            return "crc_errors"
         if not modulus:
-            return Verdict.GOOD
+            return None
         counter = self._counter(data)
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
@@ -368,7 +341,7 @@ class FrameChecker:
                 score = 1.0 if is_proof else -TWO_SENDERS / modulus
                 self._of_others = max(self._of_others + score, 0.0)
             if self._is_repeated:
-                return Verdict.REPEATED
+                return "counter_repeats"
             self._other = last
             if steps == 0:
                 steps = min(modulus, WIDE)
@@ -377,7 +350,7 @@ class FrameChecker:
                 steps = 1 if is_early else steps
             self.lost = self._lost(steps, elapsed_s)
         self._last, self._refused, self._content = counter, 0, data
-        return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD
+        return "counter_jumps" if self.lost else None
 
     def _note_rate(self, elapsed_s: float, *, in_sequence: bool) -> None:
         """Count frames beyond those that one sender sends, less what it owes since a silence."""

@@ -323,7 +323,7 @@ def _without_current(
 ) -> InputError:
     name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
     problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
-    if not statistics.messages[vehicle.current.key].wanted:
+    if not statistics.messages[vehicle.current.key]["wanted"]:
         problem = f"the capture holds no frames of {name}, which carries the current"
     cure = "check the vehicle; `cangauge inspect` lists the frames of a capture"
     if statistics.two_senders and vehicle.messages[vehicle.current.key].by_pgn:

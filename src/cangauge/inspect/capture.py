@@ -11,7 +11,7 @@ from itertools import islice
 from operator import attrgetter
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import can
 import numpy as np
@@ -20,7 +20,14 @@ from cangauge._typing import FloatArray
 from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.mapping import COUNTER
-from cangauge.bus.protection import RULES, CounterRule, E2eRule, FrameChecker, Protection, Verdict
+from cangauge.bus.protection import (
+    RULES,
+    Anomaly,
+    CounterRule,
+    E2eRule,
+    FrameChecker,
+    Protection,
+)
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import Gap, LogInspection, inspect_log
@@ -269,20 +276,14 @@ def _counts_by(
     period_s: float | None,
 ) -> dict[str, Any]:
     checker, lost, two_senders = FrameChecker(rule, period_s), 0, False
-    verdicts = dict.fromkeys(Verdict, 0)
+    anomalies: dict[str, int] = dict.fromkeys(get_args(Anomaly), 0)
     for data, time_s in zip(payloads, stamps_s, strict=True):
-        verdict = checker.check(data, time_s)
-        verdicts[verdict] += 1
-        lost += checker.lost if verdict is Verdict.AFTER_LOSS else 0
+        anomaly = checker.check(data, time_s)
+        if anomaly is not None:
+            anomalies[anomaly] += 1
+        lost += checker.lost if anomaly == "counter_jumps" else 0
         two_senders |= checker.suspects_second_sender
-    return {
-        "protection": name,
-        "crc_errors": verdicts[Verdict.CRC_WRONG],
-        "counter_jumps": verdicts[Verdict.AFTER_LOSS],
-        "frames_lost": lost,
-        "counter_repeats": verdicts[Verdict.REPEATED],
-        "two_senders": two_senders,
-    }
+    return {"protection": name, "frames_lost": lost, "two_senders": two_senders, **anomalies}
 
 
 # --- Match of the presets

@@ -333,7 +333,7 @@ def estimate_capture(
         ),
     )
     # With a model, another pack's voltage is implausible, and a current that wraps.
-    wraps = statistics.messages[vehicle.current.key].implausible > 0
+    wraps = statistics.messages[vehicle.current.key]["implausible"] > 0
     is_known = np.isfinite(recorded.voltage_v).any() and not wraps
     own = recorded if is_known else capture_samples(path, vehicle)
     require_same_pack(own.voltage_v, model, str(path))

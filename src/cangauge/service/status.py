@@ -11,15 +11,14 @@ import math
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from cangauge._logging import emit
 from cangauge._text import known_soc, plain
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.plausibility import MessageStatistics
+from cangauge.bus.plausibility import Count
 from cangauge.bus.publish import NO_REPORT
 from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
@@ -52,9 +51,7 @@ _OF_VALUES: Final = {"not_available", "implausible", "stuck", "held_back"}
 """Reasons that concern values, not whole frames."""
 _VALUES: Final = Estimate._fields[: Estimate._fields.index("status")]
 _REJECTS: Final = tuple(
-    each.name
-    for each in fields(MessageStatistics)
-    if each.name not in {"wanted", "counter_jumps", "frames_lost"}
+    name for name in get_args(Count) if name not in {"wanted", "counter_jumps", "frames_lost"}
 )
 
 
