@@ -114,7 +114,7 @@ class Pack:
                 if self._stop.is_set():
                     return
                 for frame in encoder.encode(sample):
-                    port.post(frame)
+                    port.post(frame, 1.0)
                     self.sent += 1
                 port.receive(0.0 if port.is_away else 0.001)
                 time.sleep(0.02)
