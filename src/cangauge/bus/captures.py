@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
 import can
+from can.typechecking import StringPathLike
 
 from cangauge._files import HEAD_BYTES, open_unpacked, read_beginning
 from cangauge.bus.readers import CaptureReader, capture_readers
@@ -177,7 +177,7 @@ class Capture:
             raise InputError(problem, source=self.path, cure=cure)
 
 
-def find_capture(path: str | PathLike[str], *, clock: tuple[int, float] = CLOCK) -> Capture | None:
+def find_capture(path: StringPathLike, *, clock: tuple[int, float] = CLOCK) -> Capture | None:
     """Return the capture of a file or of the parts of a run (see `run_path`); None if it is none.
 
     Raises InputError if it cannot be read. `clock` as of `Capture`.
@@ -193,7 +193,7 @@ def find_capture(path: str | PathLike[str], *, clock: tuple[int, float] = CLOCK)
     return None
 
 
-def open_capture(path: str | PathLike[str], *, clock: tuple[int, float] = CLOCK) -> Capture:
+def open_capture(path: StringPathLike, *, clock: tuple[int, float] = CLOCK) -> Capture:
     """Return the capture of a file; as `find_capture`, but InputError if it is none."""
     capture = find_capture(path, clock=clock)
     if capture is None:

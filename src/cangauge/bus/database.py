@@ -11,15 +11,15 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Final, Literal
 
 import cantools.database
 import numpy as np
+from can.typechecking import StringPathLike
 from cantools.database.can import Database, Message, Signal
 from numpy.typing import NDArray
 
@@ -93,7 +93,7 @@ Condition = tuple[BitField, frozenset[int]]
 """A multiplexer, and its values with which a signal is present in a frame."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SignalCodec:
     """Conversion of one signal: value = gain × (raw × factor + offset) + shift.
 
@@ -128,32 +128,37 @@ class SignalCodec:
     decode: Decode = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "decode", self._decoder())
+        self.decode = self._float_decoder() if self.float_format else self._integer_decoder()
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle without `decode`, which is made again."""
         given = (getattr(self, each.name) for each in dataclasses.fields(self) if each.init)
         return type(self), tuple(given)
 
-    def _decoder(self) -> Decode:
-        """Return `decode`: the kind of the signal is decided here, once, not for each frame."""
+    # `decode` is made once, with all that it needs at hand: it runs for every value.
+
+    def _float_decoder(self) -> Decode:
+        bits, number = self.field, struct.Struct(">" + self.float_format)
+        factor, offset, gain, shift = self.factor, self.offset, self.gain, self.shift
+
+        def decode(payload: bytes | bytearray) -> float:
+            value: float = number.unpack(bits.get(payload).to_bytes(number.size, "big"))[0]
+            return gain * (value * factor + offset) + shift if math.isfinite(value) else math.nan
+
+        return decode
+
+    def _integer_decoder(self) -> Decode:
         order, low_bit, mask = self.field.order, self.field.shift, self.field.mask
         factor, offset, gain, shift = self.factor, self.offset, self.gain, self.shift
-        not_available, sign_bit = self.not_available, (mask + 1) >> 1 if self.is_signed else 0
-        floating = struct.Struct(">" + (self.float_format or "d"))
+        not_available, sign_bit = self.not_available, mask + 1 >> 1 if self.is_signed else 0
 
-        def decode_float(payload: bytes | bytearray) -> float:
-            raw = (int.from_bytes(payload, order) >> low_bit) & mask
-            number: float = floating.unpack(raw.to_bytes(floating.size, "big"))[0]
-            return gain * (number * factor + offset) + shift if math.isfinite(number) else math.nan
-
-        def decode_integer(payload: bytes | bytearray) -> float:
+        def decode(payload: bytes | bytearray) -> float:
             raw = (int.from_bytes(payload, order) >> low_bit) & mask
             if raw & sign_bit:
                 raw -= mask + 1
             return math.nan if raw in not_available else gain * (raw * factor + offset) + shift
 
-        return decode_float if self.float_format else decode_integer
+        return decode
 
     def is_in(self, payload: bytes | bytearray) -> bool:
         """Return whether the signal is present, according to its multiplexers, if any."""
@@ -205,16 +210,14 @@ class SignalCodec:
             low += 1
         while high in self.not_available:
             high -= 1
-        ends = [self.gain * (raw * self.factor + self.offset) + self.shift for raw in (low, high)]
-        return min(ends), max(ends)
+        ends = sorted(self.gain * (n * self.factor + self.offset) + self.shift for n in (low, high))
+        return ends[0], ends[1]
 
     def fits(self, values: FloatArray) -> NDArray[np.bool_]:
         """Return which values `encode_into` can send; NaN counts as one."""
-        if self.float_format:
-            return np.ones(values.shape, dtype=np.bool_)
-        raw = self.raw_numbers(values)
-        low, high = self.raw_range
-        return ~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available)))
+        raw, (low, high) = self.raw_numbers(values), self.raw_range
+        is_sent = ~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available)))
+        return is_sent | bool(self.float_format)
 
     def raw_numbers(self, values: FloatArray) -> FloatArray:
         """Return the raw numbers of values, NaN for NaN."""
@@ -277,9 +280,8 @@ def signal_codec(
     """
     bits, conversion = _bits_of(message, signal), signal.conversion
     is_signed = (signal.is_signed or signed) and not conversion.is_float
-    conditions = []
-    for selector, values in _selectors(message, signal):
-        conditions.append((_bits_of(message, selector), values))
+    selectors = _selectors(message, signal)
+    conditions = [(_bits_of(message, selector), values) for selector, values in selectors]
     for name, value in (when or {}).items():
         other = _signal(message, name)
         if other is None:
@@ -289,7 +291,7 @@ def signal_codec(
         conditions.append((other_bits, frozenset({value & other_bits.mask})))
     return SignalCodec(
         name=signal.name,
-        unit=(signal.unit or "").strip(),
+        unit=signal.unit or "",
         field=bits,
         is_signed=is_signed,
         float_format=_FLOATS[signal.length] if conversion.is_float else "",
@@ -305,10 +307,9 @@ def _bits_of(message: Message, signal: Signal) -> BitField:
     bits, conversion = BitField.of(signal, message.length), signal.conversion
     if signal.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
         problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
-    elif conversion.is_float and signal.length not in _FLOATS:
-        problem = f"a float of {signal.length} bits is not possible"
-    elif not conversion.is_float and signal.length > 64:
-        problem = f"a number of {signal.length} bits is not possible"
+    elif signal.length not in (_FLOATS if conversion.is_float else range(65)):
+        problem = f"a {'float' if conversion.is_float else 'number'} of {signal.length} bits"
+        problem += " is not possible"
     elif not (0.0 < abs(conversion.scale) < math.inf and math.isfinite(conversion.offset)):
         problem = "factor and offset must be finite and the factor not 0"
     else:
@@ -319,20 +320,19 @@ def _bits_of(message: Message, signal: Signal) -> BitField:
 def _codes(signal: Signal, is_signed: bool, stated: tuple[int, ...]) -> frozenset[int]:
     """Return the codes of the value table and the stated ones, which must be possible."""
     width = signal.length
-    names: Mapping[int, object] = signal.conversion.choices or {}
     low, end = -(1 << (width - 1)) if is_signed else 0, 1 << width
     for code in stated:
+        problem = cure = ""
         if signal.conversion.is_float:
             problem, cure = "a float has no codes", "remove it: NaN and infinite are no values"
         elif not low <= code < end:
             problem = f"a signal of {width} bits never has this code"
             cure = f"state the raw code, within {low} to {end - 1}"
-        else:
-            continue
-        raise InputError(problem, field="not_available", value=code, cure=cure)
-    codes = [*stated]
-    if 2 * len(names) <= 1 << min(width, 64):  # else an enumeration, in which "invalid" is a state
-        codes += [int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name))]
+        if problem:
+            raise InputError(problem, field="not_available", value=code, cure=cure)
+    codes, names = set(stated), dict[int, object](signal.conversion.choices or {})
+    if 2 * len(names) <= end:  # else an enumeration, in which "invalid" is a state
+        codes |= {int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name))}
     # The bits of a signed signal may be stated unsigned, as most value tables do.
     return frozenset(
         code - end if is_signed and code >= -low else code for code in codes if low <= code < end
@@ -341,24 +341,23 @@ def _codes(signal: Signal, is_signed: bool, stated: tuple[int, ...]) -> frozense
 
 def _selectors(message: Message, signal: Signal) -> Iterator[tuple[Signal, frozenset[int]]]:
     """Yield the multiplexers of a signal with the values that select it, the nearest first."""
-    selector = signal
+    selector: Signal | None = signal
     for _ in message.signals:
-        if (name := selector.multiplexer_signal) is None:
-            return
-        values, above = frozenset(selector.multiplexer_ids or ()), _signal(message, name)
-        if above is None:
+        if selector is None or (name := selector.multiplexer_signal) is None:
             break
-        selector = above
-        yield selector, values
-    problem = f"its multiplexer {selector.multiplexer_signal} is missing, or its own"
-    raise InputError(problem, field="signal", value=signal.name, cure="correct the DBC")
+        values, selector = frozenset(selector.multiplexer_ids or ()), _signal(message, name)
+        if selector is not None:
+            yield selector, values
+    if selector is None or selector.multiplexer_signal is not None:
+        problem = "its multiplexer is missing, or its own"
+        raise InputError(problem, field="signal", value=signal.name, cure="correct the DBC")
 
 
 def _signal(message: Message, name: str) -> Signal | None:
     return next((each for each in message.signals if each.name == name), None)
 
 
-def load_dbc(path: str | PathLike[str], remarks: list[str] | None = None) -> Database:
+def load_dbc(path: StringPathLike, remarks: list[str] | None = None) -> Database:
     """Read a DBC file.
 
     Overlapping signals are accepted: many files have some in messages that are not wanted. What is
@@ -410,17 +409,16 @@ def find_message(database: Database, message: str | int) -> Message:
     with suppress(ValueError):
         number = message if isinstance(message, int) else int(message, 0)
     messages = database.messages
-    matching = [each for each in messages if each.name == message or each.frame_id == number]
-    if len(matching) == 1:
-        return matching[0]
-    if matching:
-        problem, cure = f"the DBC defines {len(matching)} such messages", "keep one of them"
+    found = [each for each in messages if each.name == message or each.frame_id == number]
+    if len(found) == 1:
+        return found[0]
+    near = "" if number is not None else closest(str(message), (each.name for each in messages))
+    if found:
+        problem, cure = f"the DBC defines {len(found)} such messages", "keep one of them"
     else:
-        problem = "the DBC has no such message"
-        near = "" if number is not None else closest(str(message), [m.name for m in messages])
-        cure = near and f"did you mean {near}?"
-        cure = cure or _listed([f"{m.name} (0x{m.frame_id:X})" for m in messages], "messages")
-    raise InputError(problem, value=message, cure=cure)
+        problem, cure = "the DBC has no such message", near and f"did you mean {near}?"
+    names = [f"{each.name} (0x{each.frame_id:X})" for each in messages]
+    raise InputError(problem, value=message, cure=cure or _listed(names, "messages"))
 
 
 def find_signal(
@@ -435,15 +433,15 @@ def find_signal(
     if message is not None:
         with located(None, "message"):
             searched = [find_message(database, message)]
-    found = [each for each in searched if _signal(each, signal)]
+    found = [(each, known) for each in searched if (known := _signal(each, signal)) is not None]
     if len(found) == 1:
-        return found[0], found[0].get_signal_by_name(signal)
+        return found[0]
     problem, cure = "the DBC has no such signal", "check the name in the DBC"
     if message is not None:
         problem = f"message {searched[0].name} has no such signal"
         cure = _listed([each.name for each in searched[0].signals], "signals")
     if found:
-        names = ", ".join(each.name for each in found[:5])
+        names = ", ".join(owner.name for owner, _ in found[:5])
         problem = f"{len(found)} messages have such a signal ({names})"
         cure = "name the message too"
     elif others := [each.name for each in database.messages if _signal(each, signal)]:

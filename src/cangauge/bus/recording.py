@@ -7,19 +7,18 @@ samples lack.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sized
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import Final
 
 import can
 import numpy as np
-from can.typechecking import Channel
+from can.typechecking import Channel, StringPathLike
 
 from cangauge._files import as_path
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.captures import (
     CLOCK,
     KNOWN_CAPTURES,
@@ -48,7 +47,7 @@ from one are dropped."""
 
 
 def read_log(
-    path: str | PathLike[str],
+    path: StringPathLike,
     vehicle: Vehicle | None = None,
     *,
     temperature_c: float | None = None,
@@ -139,7 +138,7 @@ def log_of(
 
 
 def open_recording(
-    path: str | PathLike[str],
+    path: StringPathLike,
     *,
     columns: ColumnMap | None = None,
     mapped: ColumnMap | None = None,
@@ -171,17 +170,15 @@ def open_recording(
     return capture
 
 
-def refuse_single_row(recorded: Sized) -> None:
+def refuse_single_row(recorded: Log | CaptureSamples) -> None:
     """Raise InputError for a log of one row: no charge can be counted."""
     if len(recorded) < 2:
-        why = "; ".join(getattr(recorded, "remarks", ()))
-        problem = "a single row: charge is counted from one row to the next"
-        problem += f" ({why})" if why else ""
-        source, cure = getattr(recorded, "source", None), "give a log of minutes or hours"
-        raise InputError(problem, source=source, cure=cure)
+        why = f" ({'; '.join(recorded.remarks)})" if recorded.remarks else ""
+        problem = f"a single row: charge is counted from one row to the next{why}"
+        raise InputError(problem, source=recorded.source, cure="give a log of minutes or hours")
 
 
-def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
+def capture_without_vehicle(path: StringPathLike) -> InputError:
     """Return the error for a capture whose vehicle is not given."""
     cure = "give --vehicle or --map"
     return InputError("this is a CAN capture, not a log", source=path, cure=cure)
@@ -233,25 +230,23 @@ class CaptureSamples:
         rows = np.isfinite(self.voltage_v) & (np.diff(self.time_s, prepend=-np.inf) > 0.0)
         if rows.sum() < 2:
             return None
+        time_s, current_a, voltage_v, soc_pct = (
+            column[rows] for column in (self.time_s, self.current_a, self.voltage_v, self.soc_pct)
+        )
+        cold_c = np.zeros(time_s.size)
         return Log(
-            self.time_s[rows],
-            self.current_a[rows],
-            self.voltage_v[rows],
-            np.zeros(int(rows.sum())),
-            self.soc_pct[rows],
-            name=self.name,
-            source=self.source,
+            time_s, current_a, voltage_v, cold_c, soc_pct, name=self.name, source=self.source
         )
 
 
-def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture:
+def open_vehicle_capture(path: StringPathLike, vehicle: Vehicle) -> Capture:
     """Open a capture; without stamps, the vehicle's current message counts time."""
     period_s = vehicle.messages[vehicle.current.key].period_s
     clock = CLOCK if period_s is None else (vehicle.current.arbitration_id, period_s)
     return open_capture(path, clock=clock)
 
 
-def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSamples:
+def capture_samples(path: StringPathLike, vehicle: Vehicle) -> CaptureSamples:
     """Return the samples of a capture, bit for bit those of the live service.
 
     Each bus in the capture has its own decoder; the bus with most samples is returned. Bus time is
@@ -265,11 +260,15 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     for bus in buses.values():
         bus.keep(bus.decoder.flush())
     channel = max(buses, key=lambda each: len(buses[each].values))
-    bus = buses[channel]
+    bus, decoder = buses[channel], buses[channel].decoder
     if not bus.values:
-        raise _without_current(path, vehicle, bus.decoder.statistics)
-    remarks = [*vehicle.remarks, *capture.info["remarks"], *_losses(bus.decoder.statistics)]
-    remarks += [*bus.decoder.wrong_periods.values(), *bus.decoder.never_decoded.values()]
+        raise _without_current(path, decoder)
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
+    if (wrapped := unsigned_reading(vehicle.current.codec, current_a)) is not None:
+        problem, cure = wrapped
+        raise InputError(problem, source=path, field=vehicle.current.codec.name, cure=cure)
+    remarks = [*vehicle.remarks, *capture.info["remarks"], *_losses(decoder.statistics)]
+    remarks += [*decoder.wrong_periods.values(), *decoder.never_decoded.values()]
     if sum(bool(each.values) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if isinstance(bus.time, ReplayClock):
@@ -278,8 +277,6 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         remarks.append(f"the replay clock starts again {bus.time.beginnings} times")
     if bus.sessions:
         remarks.append(f"the stamps start again: {len(bus.sessions) + 1} sessions in one file")
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
-    _refuse_wrapped(current_a, vehicle, path)
     return CaptureSamples(
         time_s,
         current_a,
@@ -288,7 +285,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         soc_pct,
         str(path),
         vehicle.temperature_source,
-        bus.decoder.statistics,
+        decoder.statistics,
         tuple(remarks),
         tuple(bus.sessions),
     )
@@ -318,42 +315,35 @@ class _RecordedBus:
             self.values.extend((*sample, self.decoder.reference_soc_pct))
 
 
-def _without_current(
-    path: str | PathLike[str], vehicle: Vehicle, statistics: FrameStatistics
-) -> InputError:
-    name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
+def _without_current(path: StringPathLike, decoder: SampleDecoder) -> InputError:
+    current, statistics = decoder.vehicle.current, decoder.statistics
+    name = f"0x{current.arbitration_id:X} ({current.message})"
     problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
-    if not statistics.messages[vehicle.current.key]["wanted"]:
+    if not statistics.messages[current.key]["wanted"]:
         problem = f"the capture holds no frames of {name}, which carries the current"
     cure = "check the vehicle; `cangauge inspect` lists the frames of a capture"
-    if statistics.two_senders and vehicle.messages[vehicle.current.key].by_pgn:
+    if statistics.two_senders and decoder.vehicle.messages[current.key].by_pgn:
         cure = "two source addresses send it: number it in the DBC with the pack's own, and remove"
         cure += " j1939 = true"
     return InputError(problem, source=path, cure=cure)
 
 
-def _refuse_wrapped(current_a: FloatArray, vehicle: Vehicle, path: str | PathLike[str]) -> None:
-    """Raise InputError for a current whose negative numbers are read as large ones."""
-    found = unsigned_reading(vehicle.current.codec, current_a)
-    if found is not None:
-        problem, cure = found
-        raise InputError(problem, source=path, field=vehicle.current.codec.name, cure=cure)
-
-
 def _losses(statistics: FrameStatistics) -> list[str]:
-    counts = {
-        "frames refused: wrong CRC": statistics.crc_errors,
-        "frames refused: repeated counter": statistics.counter_repeats,
-        "frames refused: too short": statistics.short,
-        "frames refused: two senders use their id or PGN": statistics.two_senders,
-        "values refused: code for 'not available'": statistics.not_available,
-        "values refused: outside their limits (of a SoC: 0–100 %)": statistics.implausible,
-        f"counter jumps: at least {statistics.frames_lost} frames lost": statistics.counter_jumps,
+    jumps = f"counter jumps: at least {statistics.frames_lost} frames lost"
+    texts = {
+        "crc_errors": "frames refused: wrong CRC",
+        "counter_repeats": "frames refused: repeated counter",
+        "short": "frames refused: too short",
+        "two_senders": "frames refused: two senders use their id or PGN",
+        "not_available": "values refused: code for 'not available'",
+        "implausible": "values refused: outside their limits (of a SoC: 0–100 %)",
+        "counter_jumps": jumps,
     }
+    counts = {text: getattr(statistics, name) for name, text in texts.items()}
     return [f"{count} {text}" for text, count in counts.items() if count]
 
 
-def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
+def capture_to_log(path: StringPathLike, vehicle: Vehicle) -> Log:
     """Return a capture as a log; `soc_pct` is the car's own, if it sends one.
 
     A log has every value in every row. Time stamps that do not increase are dropped; voltage is
@@ -361,52 +351,44 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     the first. Remarks count these rows and the lost frames. Raises InputError as `capture_samples`,
     and without voltage or temperature, or for values that are not a battery's.
     """
-    samples, path = capture_samples(path, vehicle), Path(path)
-    remarks, time_s = list(samples.remarks), samples.time_s
-    begun = np.searchsorted(samples.sessions, np.arange(time_s.size), side="right")
-    time_s = time_s + PAUSE_S * begun  # no charge is counted over it
-    keep = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
-    dropped = np.count_nonzero(~keep)
-    if dropped > 0.5 * keep.size:
+    samples = capture_samples(path, vehicle)
+    remarks = list(samples.remarks)
+    begun = np.searchsorted(samples.sessions, np.arange(len(samples)), side="right")
+    time_s = samples.time_s + PAUSE_S * begun  # no charge is counted over it
+    advances = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
+    if 2 * advances.sum() < advances.size:
         problem = "time runs backwards or does not advance in the capture"
         cure = "split it where time starts again; record with stamps that increase (candump -l)"
         raise InputError(problem, source=path, cure=cure)
-    if dropped:
-        remarks.append(f"{dropped} samples dropped whose time does not advance")
-    values = {name: getattr(samples, name)[keep] for name in LOG_COLUMNS.values()}
-    values["time_s"] = time_s[keep]
-    time_s, voltage_v, temperature_c = (
-        values[name] for name in ("time_s", "voltage_v", "temperature_c")
-    )
-    is_known = np.isfinite(voltage_v)
-    if not is_known.any():
+    rows = {name: getattr(samples, name)[advances] for name in LOG_COLUMNS.values()}
+    rows["time_s"] = time_s[advances]
+    filled, is_complete = _filled(rows["time_s"], rows["voltage_v"])
+    if not is_complete.any():
         problem = "the capture gives no voltage that pairs with a current"
         where, cure = vehicle.voltage.message, "check the mapping, and pair_within_s"
         raise InputError(problem, source=path, field=where, cure=cure)
-    before_s = np.maximum.accumulate(np.where(is_known, time_s, -np.inf))
-    after_s = np.minimum.accumulate(np.where(is_known, time_s, np.inf)[::-1])[::-1]
-    near = ~is_known & (after_s - before_s <= VOLTAGE_FILL_S)
-    voltage_v[near] = np.interp(time_s[near], time_s[is_known], voltage_v[is_known])
-    complete = is_known | near
-    if near.any():
-        remarks.append(f"{np.count_nonzero(near)} samples without voltage: interpolated")
-    if not complete.all():
-        remarks.append(f"{np.count_nonzero(~complete)} samples without voltage dropped")
-    warm = np.flatnonzero(np.isfinite(temperature_c))
+    warm = np.flatnonzero(np.isfinite(rows["temperature_c"]))
     if not warm.size:
         where = "" if vehicle.temperature is None else vehicle.temperature.message
         problem, cure = "the capture gives no temperature", "give --temperature °C"
         raise InputError(problem, source=path, field=where or None, cure=cure)
-    if missing := temperature_c.size - warm.size:
-        latest = np.searchsorted(warm, np.arange(temperature_c.size), side="right") - 1
-        values["temperature_c"] = temperature_c[warm[np.maximum(latest, 0)]]
-        remarks.append(f"{missing} samples without temperature: the nearest is used")
-    values = {name: column[complete] for name, column in values.items()}
-    if not np.isfinite(values["soc_pct"]).any():
-        del values["soc_pct"]
+    latest = np.searchsorted(warm, np.arange(filled.size), side="right") - 1
+    interpolated = is_complete & np.isnan(rows["voltage_v"])
+    counts = {
+        "dropped whose time does not advance": ~advances,
+        "without voltage: interpolated": interpolated,
+        "without voltage dropped": ~is_complete,
+        "without temperature: the nearest is used": np.isnan(rows["temperature_c"]),
+    }
+    remarks += [f"{n} samples {text}" for text, of in counts.items() if (n := of.sum())]
+    rows["voltage_v"] = filled
+    rows["temperature_c"] = rows["temperature_c"][warm[np.maximum(latest, 0)]]
+    rows = {name: column[is_complete] for name, column in rows.items()}
+    if not np.isfinite(rows["soc_pct"]).any():
+        del rows["soc_pct"]
     log = Log(
-        **values,
-        name=path.name.split(".")[0],
+        **rows,
+        name=samples.name,
         source=str(path),
         temperature_source=vehicle.temperature_source,
         remarks=tuple(remarks),
@@ -417,6 +399,19 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
         return agreeing(log, labels=labels, in_seconds=True)
     except InputError as error:
         raise _of_capture(error, vehicle) from error
+
+
+def _filled(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return values interpolated between known ones, and which have a value now.
+
+    None has between known ones more than `VOLTAGE_FILL_S` apart, nor outside them.
+    """
+    known_s = time_s[np.isfinite(values)]
+    ends_s = np.concatenate([[-np.inf], known_s, [np.inf]])
+    before = np.searchsorted(known_s, time_s, side="right")
+    is_near = ends_s[before + 1] - ends_s[before] <= VOLTAGE_FILL_S
+    filled = np.interp(time_s, known_s, values[np.isfinite(values)]) if known_s.size else values
+    return filled, is_near | np.isfinite(values)
 
 
 def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:
@@ -432,9 +427,8 @@ def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:
     elif error.problem.endswith(WRAPPED):
         cure = f"state signed = true {table}"
     elif error.problem.startswith("row "):
-        codec = signal.codec
-        raw = round(((value - codec.shift) / codec.gain - codec.offset) / codec.factor)
-        cure = f"if it is a code without a value, state not_available = [{raw}] {table}"
-        if codec.float_format:
+        raw = signal.codec.raw_numbers(np.array(value))
+        cure = f"if it is a code without a value, state not_available = [{raw:.0f}] {table}"
+        if signal.codec.float_format:
             cure = f"state lowest and highest {table}"
     return InputError(error.problem, source=error.source, field=error.field, value=value, cure=cure)

@@ -9,12 +9,11 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from can.typechecking import CanFilter
+from can.typechecking import CanFilter, StringPathLike
 from cantools.database.can import Message
 
 from cangauge._config import read_toml, validated
@@ -125,8 +124,8 @@ class Vehicle:
     def load(
         cls,
         preset: str | None = None,
-        dbc: str | PathLike[str] | None = None,
-        map: str | PathLike[str] | None = None,  # noqa: A002 - as the option --map
+        dbc: StringPathLike | None = None,
+        map: StringPathLike | None = None,  # noqa: A002 - as the option --map
         *,
         temperature_c: float | None = None,
         pair_within_s: float | None = None,
@@ -461,7 +460,7 @@ PRESETS: Final = _presets()
 """By the name that `--vehicle` takes."""
 
 
-def _find_preset(name: str, *, field: str, source: str | PathLike[str] | None = None) -> Preset:
+def _find_preset(name: str, *, field: str, source: StringPathLike | None = None) -> Preset:
     """Return the preset of that name; case does not matter, nor does `-` for `_`.
 
     Raises InputError with `field` and `source` if there is none.
@@ -475,7 +474,7 @@ def _find_preset(name: str, *, field: str, source: str | PathLike[str] | None = 
     raise InputError("unknown vehicle", source=source, field=field, value=name, cure=cure)
 
 
-def _with_preset(own: dict[str, Any], source: str | PathLike[str]) -> dict[str, Any]:
+def _with_preset(own: dict[str, Any], source: StringPathLike) -> dict[str, Any]:
     """Return the tables of a map file, added to those of the preset that it is `like`, if any."""
     if "like" not in own:
         return own

@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import islice
 from operator import attrgetter
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final, get_args
 
 import can
 import numpy as np
+from can.typechecking import StringPathLike
 
 from cangauge._typing import FloatArray
 from cangauge.bus.captures import open_capture
@@ -126,7 +126,7 @@ class CaptureInspection:
 
 
 def inspect_capture(
-    path: str | PathLike[str], vehicle: Vehicle | None = None, frames: int | None = None
+    path: StringPathLike, vehicle: Vehicle | None = None, frames: int | None = None
 ) -> CaptureInspection:
     """Inspect a capture, or its first `frames`; with a vehicle, also the decoded log.
 
