@@ -45,7 +45,7 @@ def test_an_overflow_of_the_receive_queue_is_counted_and_stated(address: BusAddr
         lost = port.queue_drops
         assert lost
         with Service(port, pipeline, loop_config()) as service:
-            assert waits(lambda: pipeline.counts.frames == len(frames) - lost)
+            assert waits(lambda: pipeline.counts["frames"] == len(frames) - lost)
             assert waits(lambda: bool(service.warnings))
             text = f"{port.name}: the receive queue overflowed: {lost} frames lost ({lost} so far)"
             assert service.warnings[0] == f"warning: {text}"
