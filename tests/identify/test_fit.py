@@ -69,7 +69,7 @@ def test_recovers_curve_and_resistance_of_a_pack() -> None:
 
 
 def curve_std_v(found: Identification, soc_pct: FloatArray) -> FloatArray:
-    functions = found.model.principal_functions()
+    functions = found.model.functions
     zero = np.zeros(len(found.voltage_model.load_coefficients))
     return np.array([np.linalg.norm(functions.row(soc, zero)) for soc in soc_pct.tolist()])
 

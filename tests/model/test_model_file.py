@@ -53,7 +53,7 @@ def test_information_holds_the_coefficients(model: Model) -> None:
 
 def test_functions_reproduce_the_covariance_of_the_voltage(model: Model) -> None:
     assert model.information is not None
-    functions = model.principal_functions()
+    functions = model.functions
     voltage = model.voltage_model()
     covariance = np.linalg.inv(np.array(model.information.root))
     covariance = covariance @ covariance.T
@@ -69,7 +69,7 @@ def test_prior_is_a_model_of_its_chemistry() -> None:
     model = Model.prior("lfp", cells=16, capacity_ah=100.0)
     assert model.voltage_model().nominal_v == pytest.approx(16 * 3.29, rel=0.01)
     assert model.noise.level_std_v == pytest.approx(0.008 * 16 * 3.29, rel=0.01)
-    functions = model.principal_functions()
+    functions = model.functions
     zero = np.zeros(len(model.voltage_model().load_coefficients))
     std_v = float(np.sqrt(np.sum(functions.row(100.0, zero) ** 2)))
     assert std_v == pytest.approx(0.02 * 16 * 3.29, rel=0.05)

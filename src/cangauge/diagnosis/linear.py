@@ -88,13 +88,14 @@ def stated_covariance(about: ExtendedModel, given: Model) -> FloatArray:
 
     Its principal functions leave a part of it: 2 % of the chemistry's uncertainty are added.
     """
-    functions, loads = given.principal_functions(), given.extended_model().model.loads
+    functions, voltage = given.functions, given.voltage_model()
+    loads, of_load = voltage.loads, functions.load_parts(voltage.load_coefficients.size)
     ohms = 1 + len(loads.resistance_ohm)
     _, typical = prior(about, given, about.pack.voltage_v, 50.0)
     change = np.zeros((len(typical), functions.number))
     for k in range(functions.number):
         change[:N, k] = np.interp(KNOTS_PCT, functions.soc_pct, functions.value[:, k])
-    change[N : N + ohms] = functions.load[:ohms]
+    change[N : N + ohms] = of_load[:ohms]
     if loads.arrhenius is not None:
-        change[-1] = functions.load[ohms]
+        change[-1] = of_load[ohms]
     return np.asarray(change @ change.T + 0.02**2 * np.diag(np.diag(typical)))

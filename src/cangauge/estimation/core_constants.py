@@ -102,11 +102,11 @@ def model_constants(estimator: Estimator, forms: list[CoreForm]) -> Constants:
         **{name: getattr(noise, name) for name in NOISE},
         **estimator.limits._asdict(),
         "functions": functions.number,
-        "function_knots": functions.soc_pct.size,
+        "function_knots": len(functions.soc_pct),
         "function_pct": functions.soc_pct,
         "function_v": functions.value,
         "function_slope": functions.slope,
-        "function_load": functions.load,
+        "function_load": functions.load_parts(voltage.load_coefficients.size),
         "effects": len(forms),
         "skew_s": sum(form.values[0] for form in forms if form.kind == "time_skew"),
     }

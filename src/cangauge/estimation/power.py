@@ -153,10 +153,14 @@ class _Ahead:
         self._fixed_v = self._level_v * float(x[LEVEL]) + self._A * float(x[SLOW])
         functions, learned = model.functions, x[FUNCTIONS:-2]
         self._learned = HermiteCurve(
-            functions.soc_pct, functions.value @ learned, functions.slope @ learned
+            np.array(functions.soc_pct), functions.value @ learned, functions.slope @ learned
         )
         theta = model.load_coefficients
-        self._theta = theta + self.resistance * np.r_[0.0, theta[1:]] + functions.load @ learned
+        self._theta = (
+            theta
+            + self.resistance * np.r_[0.0, theta[1:]]
+            + functions.load_parts(theta.size) @ learned
+        )
 
     def slope_at(self, soc_pct: float) -> float:
         """Return the curve's slope [V per %], not less than the least."""

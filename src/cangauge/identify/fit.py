@@ -44,9 +44,9 @@ from cangauge.model.coulomb_counting import capacity_from_full_discharge, capaci
 from cangauge.model.effects.base import Effect, Values
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import FunctionFields, Information, Made, Model, SourceLog
+from cangauge.model.model_file import Information, Made, Model, SourceLog
 from cangauge.model.noise import Noise
-from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
+from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior, principal_functions
 from cangauge.model.voltage_model import DELAYS_S, KNOTS_PCT, Ranges
 
 Equation = Literal["knots", "published"]
@@ -468,7 +468,7 @@ def _fit_published(
     model = Model(
         equation="published",
         published=found,
-        functions=FunctionFields.of(
+        functions=principal_functions(
             fields["chemistry"], covariance, found.loads, fields["capacity_ah"]
         ),
         noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),

@@ -286,7 +286,7 @@ def start_by_model(log: Log, model: Model) -> Start:
     best = _minimum(error_v, low, high)
     soc_pct, celsius = moved_pct + best, prediction.signals.temperature_c[at]
     columns = voltage.load_columns(celsius, prediction.currents_a).mean(axis=0)
-    by_functions = model.principal_functions().row(float(np.mean(soc_pct)), columns)
+    by_functions = model.functions.row(float(np.mean(soc_pct)), columns)
     lasting_v = np.hypot(np.linalg.norm(by_functions), model.noise.level_std_v)
     slope = float(np.mean(voltage.pseudo_ocv_slope(soc_pct)))
     slope = max(slope, SLOPE_AT_LEAST * voltage.nominal_v)

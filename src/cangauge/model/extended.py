@@ -326,7 +326,7 @@ class OnlineModel:
         """
         currents = load[1 : 1 + len(self.model.loads.delays_s) + len(self.model.loads.low_pass_s)]
         change = self.load_at(self.model.usual_c + UNKNOWN_STD_K, currents) - load
-        by_functions = change @ self.functions.load
+        by_functions = change @ self.functions.load_parts(change.size)
         return math.hypot(float(change @ self.load_coefficients), *by_functions.tolist())
 
     def pseudo_ocv_at(

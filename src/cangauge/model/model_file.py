@@ -19,7 +19,6 @@ from pydantic import (
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._text import number, significant, span
-from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, as_log
 from cangauge.model.effects.base import Pack, Signals
@@ -148,26 +147,6 @@ class CurveKnots(Fields):
     voltage_v: tuple[Value, ...]
 
 
-class FunctionFields(Fields):
-    """Joint principal functions of the coefficients' covariance, of standard deviation 1."""
-
-    soc_pct: Knots
-    curve_v: list[list[Value]]
-    """Part of each function in the curve at `soc_pct` [V]."""
-    load: list[list[Value]]
-    """Part of each function in the coefficients of the load columns."""
-
-    @classmethod
-    def of(
-        cls, chemistry: ChemistryName, covariance: FloatArray, loads: Loads, capacity_ah: float
-    ) -> Self:
-        """Return a covariance of knots and load coefficients (`prior.principal_functions`)."""
-        number, n = CHEMISTRIES[chemistry].functions, KNOTS_PCT.size
-        functions = principal_functions(covariance, loads, capacity_ah, number)
-        curve_v, load = functions[:, :n].tolist(), functions[:, n:].tolist()
-        return cls(soc_pct=KNOTS_PCT.tolist(), curve_v=curve_v, load=load)
-
-
 class Information(Fields):
     """Posterior of all coefficients: RᵀR is its precision, R·θ = `projected` its mean.
 
@@ -219,7 +198,7 @@ class Model(Fields):
     curve: CurveKnots | None = None
     loads: Loads | None = None
     published: Published | None = None
-    functions: FunctionFields
+    functions: Functions
     noise: Noise
     effects: list[dict[str, Any]] = Field(default=[])
     range: Ranges
@@ -282,14 +261,6 @@ class Model(Fields):
         lacking = "published" if self.equation == "published" else "curve, loads"
         raise InputError(f"missing, though the equation is {self.equation}", field=lacking)
 
-    def principal_functions(self) -> Functions:
-        """Return the covariance of the coefficients in reduced form."""
-        soc_pct = np.array(self.functions.soc_pct)
-        value = np.array(self.functions.curve_v).reshape(-1, soc_pct.size).T
-        columns = self.voltage_model().load_coefficients.size
-        load = np.array(self.functions.load).reshape(-1, columns).T
-        return Functions(soc_pct, value, load)
-
     def extended_model(self) -> ExtendedModel:
         """Return the voltage model with the effects.
 
@@ -322,11 +293,11 @@ class Model(Fields):
             Least standard deviation of the voltage's lasting error [% of the voltage]. The logs of
             a fit do not show that of their sensor: one made them all.
         """
-        extended, functions = self.extended_model(), self.principal_functions()
+        extended = self.extended_model()
         least_v = 0.01 * voltage_accuracy_pct * extended.model.nominal_v
         level_v = max(self.noise.level_std_v, least_v)
         noise = self.noise.model_copy(update={"level_std_v": level_v})
-        return OnlineModel(extended, functions, noise, capacity_ah, gap_s)
+        return OnlineModel(extended, self.functions, noise, capacity_ah, gap_s)
 
     def predict(
         self, log: Log | Path | str | Any, *, initial_soc_pct: float | None = None
@@ -450,7 +421,7 @@ class Model(Fields):
             equation="knots",
             curve=CurveKnots(soc_pct=tuple(KNOTS_PCT.tolist()), voltage_v=tuple(curve_v)),
             loads=loads,
-            functions=FunctionFields.of(chemistry, covariance, loads, fields["capacity_ah"]),
+            functions=principal_functions(chemistry, covariance, loads, fields["capacity_ah"]),
             noise=Noise.of(
                 chemistry,
                 known.mean_v,

@@ -32,6 +32,7 @@ from cangauge.model.voltage_model import (
     LEAF_2012_CELLS,
     LEAF_2012_OCV_V,
     REFERENCE_C,
+    Functions,
     Loads,
     PublishedCurve,
     hermite_basis,
@@ -322,21 +323,21 @@ class PackPrior:
 
 
 def principal_functions(
-    covariance: FloatArray, loads: Loads, capacity_ah: float, number: int
-) -> FloatArray:
-    """Return the joint principal functions of the coefficients' covariance, shape (n, p).
+    chemistry: ChemistryName, covariance: FloatArray, loads: Loads, capacity_ah: float
+) -> Functions:
+    """Return the joint principal functions of the coefficients' covariance.
 
     They explain most of the variance of the voltage, over all SoC and the loads of a usual drive.
 
     Parameters
     ----------
+    chemistry : {"oxide", "lfp"}
+        Which states their number.
     covariance : array of shape (p, p)
         Of the knots and the coefficients of the load columns.
     loads : Loads
     capacity_ah : float
         [Ah].
-    number : int
-        n.
     """
     usual_a = TYPICAL_C_RATE * capacity_ah
     usual = [TYPICAL_K, *[usual_a] * len(loads.resistance_ohm)]
@@ -350,6 +351,8 @@ def principal_functions(
     weight[n:, n:] = np.diag(np.array(usual) ** 2)
     root = np.linalg.cholesky(weight)
     variance, direction = np.linalg.eigh(root.T @ covariance @ root)
-    first = np.argsort(variance)[::-1][:number]
+    first = np.argsort(variance)[::-1][: CHEMISTRIES[chemistry].functions]
     scaled = direction[:, first] * np.sqrt(np.maximum(variance[first], 0.0))
-    return np.asarray(np.linalg.solve(root.T, scaled).T)
+    parts = np.linalg.solve(root.T, scaled).T
+    curve_v, load = parts[:, :n].tolist(), parts[:, n:].tolist()
+    return Functions(soc_pct=tuple(KNOTS_PCT.tolist()), curve_v=curve_v, load=load)

@@ -36,6 +36,7 @@ from cangauge.model.fields import (
     Celsius,
     Delays,
     Fields,
+    Knots,
     Seconds,
     Soc,
     Value,
@@ -231,34 +232,40 @@ class HermiteCurve:
         return np.asarray(cubics.sum(cubics.slope, self.value, self.slope))
 
 
-@dataclass(frozen=True, eq=False)
-class Functions:
+class Functions(Fields):
     """Principal components of the covariance of the curve's and the load's coefficients together.
 
     A function is the part of a component in the voltage, at an amplitude of one standard deviation.
-
-    Parameters
-    ----------
-    soc_pct : array of shape (knots,)
-    value : array of shape (knots, n)
-        Each function's part in the curve [V].
-    load : array of shape (k, n)
-        Each function's part in the coefficients of the load columns.
     """
 
-    soc_pct: FloatArray
-    value: FloatArray
-    load: FloatArray
-
-    @cached_property
-    def slope(self) -> FloatArray:
-        """Slopes of the parts in the curve [V per %], shape (knots, n)."""
-        return hermite_slopes(self.soc_pct, self.value)
+    soc_pct: Knots
+    curve_v: list[list[Value]]
+    """Part of each function in the curve at `soc_pct` [V]."""
+    load: list[list[Value]]
+    """Part of each function in the coefficients of the load columns."""
 
     @property
     def number(self) -> int:
         """Number n of functions."""
-        return int(self.load.shape[1])
+        return len(self.curve_v)
+
+    @cached_property
+    def value(self) -> FloatArray:
+        """Parts in the curve [V], shape (knots, n)."""
+        return np.reshape(self.curve_v, (self.number, len(self.soc_pct))).T
+
+    @cached_property
+    def slope(self) -> FloatArray:
+        """Slopes of the parts in the curve [V per %], shape (knots, n)."""
+        return hermite_slopes(np.array(self.soc_pct), self.value)
+
+    @cached_property
+    def _load(self) -> FloatArray:
+        return np.array(self.load)
+
+    def load_parts(self, columns: int) -> FloatArray:
+        """Return the parts in the coefficients of k load columns, shape (k, n)."""
+        return self._load.reshape(self.number, columns).T
 
     def row(self, soc_pct: float, load: FloatArray) -> FloatArray:
         """Return the change of voltage by each function [V], shape (n,).
@@ -269,8 +276,10 @@ class Functions:
         load : array of shape (k,)
             A row of `VoltageModel.load_columns`.
         """
-        cubic = _cubic_at(self.soc_pct.tolist(), soc_pct)
-        return np.asarray(cubic.sum(cubic.value, self.value, self.slope) + load @ self.load)
+        cubic = _cubic_at(self.soc_pct, soc_pct)
+        return np.asarray(
+            cubic.sum(cubic.value, self.value, self.slope) + load @ self.load_parts(load.size)
+        )
 
 
 def _scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:

@@ -61,7 +61,7 @@ def within(parameter: Parameter, part: float, pack: Pack = PACK) -> float:
 
 def online_of(extended: ExtendedModel, capacity_ah: float | None = None) -> OnlineModel:
     """The sample-by-sample form with a delay line that keeps every sample."""
-    online = OnlineModel(extended, FILE.principal_functions(), FILE.noise, capacity_ah)
+    online = OnlineModel(extended, FILE.functions, FILE.noise, capacity_ah)
     online.delay_line = DelayLine(extended.model.loads.delays_s, gap_s=math.inf, spacing_s=0.0)
     return online
 

@@ -133,7 +133,7 @@ class Chain:
 
     def __init__(self, logs: Sequence[Log], model: Model) -> None:
         self.model, self.extended = model, model.extended_model()
-        self.functions = model.principal_functions()
+        self.functions = model.functions
         cuts, parts = list[tuple[int, slice, bool]](), list[Samples]()
         for number, log in enumerate(logs):
             step_pct = resolution_pct(log)
@@ -194,8 +194,10 @@ class Chain:
 
     def function_columns(self, soc_pct: FloatArray) -> FloatArray:
         """Return what the principal functions add to the voltage [V], shape (blocks, functions)."""
-        curve = hermite_basis(soc_pct, self.functions.soc_pct) @ self.functions.value
-        return np.asarray(curve + self.blocks.load @ self.functions.load)
+        curve = hermite_basis(soc_pct, np.array(self.functions.soc_pct)) @ self.functions.value
+        return np.asarray(
+            curve + self.blocks.load @ self.functions.load_parts(self.blocks.load.shape[1])
+        )
 
     def _fitting(self) -> FloatArray:
         """Return the SoC with the start of each stretch at which the voltage fits best [%]."""

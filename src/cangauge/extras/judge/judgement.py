@@ -25,8 +25,9 @@ from cangauge.extras.judge.weak import weakest_cell
 from cangauge.logs.charge import implied_capacity
 from cangauge.logs.log import Log, as_log
 from cangauge.logs.read import CellColumns
-from cangauge.model.model_file import PRIOR_MADE_BY, FunctionFields, Model, as_model
+from cangauge.model.model_file import PRIOR_MADE_BY, Model, as_model
 from cangauge.model.prior import ChemistryName
+from cangauge.model.voltage_model import Functions
 
 KNOWN: Final[Mapping[str, Mapping[str, float]]] = {
     "fitted": {"zero": 0.75, "voltage": 0.25, "capacity": 1.5},
@@ -312,14 +313,16 @@ def narrowed(judgement: Judgement) -> Model:
     if before is None or given is None or given.arrhenius is None:
         problem = "the model states no error of its curve that logs could narrow"
         raise InputError(problem, field="--output", cure="make the model by `cangauge fit`")
-    functions, best = model.principal_functions(), judgement.fits[0]
+    functions, best = model.functions, judgement.fits[0]
     of = slice(len(best.faults), len(best.faults) + functions.number)
     mean, covariance = best.posterior.mean[of], best.posterior.covariance[of, of]
     root = np.linalg.cholesky(covariance + 1e-12 * np.eye(functions.number))
     curve_v = before.voltage_v + np.interp(
         before.soc_pct, functions.soc_pct, functions.value @ mean
     )
-    kt, *ohm, factor = model.voltage_model().load_coefficients + functions.load @ mean
+    coefficients = model.voltage_model().load_coefficients
+    of_load = functions.load_parts(coefficients.size)
+    kt, *ohm, factor = coefficients + of_load @ mean
     loads = {
         "kt_v_per_k": kt,
         "resistance_ohm": tuple(ohm),
@@ -332,10 +335,10 @@ def narrowed(judgement: Judgement) -> Model:
                 update={"voltage_v": tuple(np.maximum.accumulate(curve_v).tolist())}
             ),
             "loads": given.model_copy(update=loads),
-            "functions": FunctionFields(
-                soc_pct=functions.soc_pct.tolist(),
+            "functions": Functions(
+                soc_pct=functions.soc_pct,
                 curve_v=(functions.value @ root).T.tolist(),
-                load=(functions.load @ root).T.tolist(),
+                load=(of_load @ root).T.tolist(),
             ),
         }
     )

@@ -78,7 +78,8 @@ def weakest_cell(
     size = gain * float(lack[weakest])
     # A capacity is as well known as the slope of the curve over the SoC that was visited.
     visited_pct = np.array([S.min(), S.max()])
-    of_functions = hermite_basis(visited_pct, chain.functions.soc_pct) @ chain.functions.value
+    knots_pct = np.array(chain.functions.soc_pct)
+    of_functions = hermite_basis(visited_pct, knots_pct) @ chain.functions.value
     over_v = np.diff(chain.extended.model.pseudo_ocv(visited_pct))
     slope_std = float(np.linalg.norm(np.diff(of_functions, axis=0)) / over_v[0])
     std = float(np.hypot(np.sqrt(gain) * spread, slope_std * size))
