@@ -7,7 +7,7 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, product, repeat
 from typing import Any, Final, NamedTuple
@@ -15,14 +15,14 @@ from typing import Any, Final, NamedTuple
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from cangauge._files import Head, as_utf8
+from cangauge._files import HEAD_BYTES, Head, as_utf8
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps, is_stamp
-from cangauge.logs.values import is_number, read_cells, unit_in_cell
+from cangauge.logs.values import is_number, numbers_in, read_cells, unit_in_cell
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
@@ -61,22 +61,29 @@ class TextTable(NamedTuple):
             return "skip"
 
         names = [f"c{place}" for place in range(width)]
-        types = {names[place]: pa.string() for place in places}
         # One thread: otherwise pyarrow does not number odd rows.
-        options = (
-            pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines),
-            pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip),
-            pacsv.ConvertOptions(
+        how = pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines)
+        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
+
+        def parsed(part: bytes, types: Mapping[str, Any]) -> Any:
+            cells = pacsv.ConvertOptions(
                 include_columns=[*types],
                 column_types=types,
                 strings_can_be_null=True,
                 check_utf8=False,  # `as_utf8` has
-            ),
-        )
+            )
+            odd_rows.clear()
+            return pacsv.read_csv(pa.BufferReader(part), how, rows, cells)
+
         data = as_utf8(self.head.read())
         is_whole = data.endswith((b"\n", b"\r"))
+        types = {names[place]: pa.string() for place in places}
         try:
-            table = pacsv.read_csv(pa.BufferReader(data), *options)
+            beginning = parsed(data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1] or data, types)
+            try:
+                table = parsed(data, types | numbers_in(beginning))
+            except pa.ArrowInvalid:  # a cell far below is no bare number
+                table = parsed(data, types)
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0]
             raise self._error(f"the table cannot be read: {reason}", "export it again") from error

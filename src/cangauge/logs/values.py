@@ -68,6 +68,18 @@ def read_cells(columns: Mapping[int, Any], headings: Sequence[str]) -> dict[int,
     return read
 
 
+def numbers_in(beginning: Any) -> dict[str, Any]:
+    """Return the types of columns of numbers by the beginning of a table, unless one is spelled.
+
+    They are then parsed without the text, which would take twice the memory of a long log.
+    """
+    columns = dict(zip(beginning.column_names, beginning.columns, strict=True))
+    texts = [cells for cells in columns.values() if is_text(_as_numbers(cells))]
+    is_spelled = any(map(_begins_with_number, texts))
+    bare = {} if is_spelled else columns
+    return {name: pa.float64() for name, cells in bare.items() if not is_text(_as_numbers(cells))}
+
+
 def _as_numbers(cells: Any) -> Any:
     """Return cells of text as numbers, or as they are if one is none."""
     try:
