@@ -209,7 +209,8 @@ def _counts(log: Log, least_pct: float, *, at_ends: bool = True) -> Iterator[_Co
     for piece in split_where_moved(log):
         if piece.soc_pct is None:
             return
-        rows = np.isfinite(piece.soc_pct)
+        rows = np.flatnonzero(np.isfinite(piece.soc_pct))
+        rows = rows[:: 1 + rows.size // 1_000_000]  # more show no more, and take memory
         soc_pct, time_s = piece.soc_pct[rows], piece.time_s[rows]
         steps = np.abs(np.diff(soc_pct))
         if not np.any(steps > 0.0):
@@ -250,8 +251,10 @@ def _sampling_std_ah(log: Log) -> float:
     A current that is independent from row to row deviates from the mean of its neighbours by
     sqrt(3/2) of its standard deviation; each row stands for half of the two steps beside it.
     """
+    apart_as = log.current_a[:-2] + log.current_a[2:]  # in place: a log may have millions of rows
+    apart_as *= -0.5
+    apart_as += log.current_a[1:-1]
     step_s = np.diff(log.time_s)
     step_s[step_s > bridge_s(log.time_s)] = 0.0
-    apart_a = log.current_a[1:-1] - 0.5 * (log.current_a[:-2] + log.current_a[2:])
-    stands_for_s = 0.5 * (step_s[:-1] + step_s[1:])
-    return float(np.sqrt(np.sum((apart_a * stands_for_s) ** 2) / 1.5) / 3600.0)
+    apart_as *= 0.5 * (step_s[:-1] + step_s[1:])
+    return float(np.sqrt(np.sum(np.square(apart_as, out=apart_as)) / 1.5) / 3600.0)

@@ -144,15 +144,14 @@ class LogFile:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
         try:
             draft = reader.read(self.head, self.columns)
+            pa.default_memory_pool().release_unused()  # the table's, before the checks take theirs
             draft.ignored = tuple(name for name in draft.ignored if name not in self.read_besides)
-            log = draft.log(temperature_c, temperature_source, self.sign)
+            return draft.log(temperature_c, temperature_source, self.sign)
         except UnknownColumnsError as error:
             raise error.proposing(partial(self.can_read, reader)) from error
         except MemoryError as error:
             problem, cure = "larger than the free memory", "split it"
             raise InputError(problem, source=self.head.path, cure=cure) from error
-        pa.default_memory_pool().release_unused()
-        return log
 
     def can_read(self, reader: LogReader, columns: ColumnMap) -> bool:
         """Return whether a reader makes a log of the file's beginning by these columns."""

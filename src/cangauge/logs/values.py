@@ -160,7 +160,7 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
         cure = "correct the cell, or leave it empty where the value is unknown"
         problem = f"row {row} is not a number"
         raise InputError(problem, source=source, field=label, value=value, cure=cure) from error
-    return np.require(numbers.to_numpy(), np.float64, "W"), unit
+    return np.array(numbers.to_numpy(), dtype=np.float64), unit  # not the memory of the table
 
 
 def unit_in_cell(text: str) -> str:
