@@ -92,6 +92,14 @@ def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
     assert table["now.error_pct"] == [alone["now"]["error_pct"]]
 
 
+def test_a_gauge_that_stands_still_is_judged(folder: Path) -> None:
+    drive = cangauge.read_log(drives(folder)[3])
+    shown = drive.soc_pct.copy()
+    shown[len(drive) // 4 :] = shown[len(drive) // 4]
+    write_log(replace(drive, soc_pct=shown), folder / "stuck.parquet")
+    assert table_of(folder, "judge", [folder / "stuck.parquet"])["now.verdict"] == ["off"]
+
+
 @pytest.mark.parametrize(
     ("answer", "shown"),
     [("estimate", "SoC MAE [%]"), ("gap", "P(none)"), ("judge", "verdict")],

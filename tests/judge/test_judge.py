@@ -97,6 +97,21 @@ def test_an_offset_of_the_sensor_is_taken_out_of_the_corrected_soc(pack: Pack) -
         assert moved == pytest.approx(truly, abs=1.5)  # the count alone: 4 % off
 
 
+@pytest.mark.parametrize(("before", "since_log"), [(5, 5), (3, 4)])
+def test_an_offset_is_dated_among_the_last_eight_logs(
+    pack: Pack, before: int, since_log: int
+) -> None:
+    model, logs = pack
+    days = [
+        replace(log, time_s=log.time_s + 86400.0 * day, voltage_v=log.voltage_v + 1e-3 * day)
+        for day, log in enumerate([*logs, *logs[::-1], *logs[:2]])  # no two alike
+    ]
+    offset_a = model.capacity_ah / 15.0
+    changed = [*days[:before], *with_offset(days[before:], model, offset_a)]
+    found = {fault.name: fault for fault in cangauge.judge(changed, model).faults}
+    assert found["current_offset"].since[0] == since_log
+
+
 def test_a_wrong_start_is_named_and_the_corrected_soc_follows_the_truth(pack: Pack) -> None:
     model, logs = pack
     judgement = cangauge.judge(shifted(logs, *[-12.0] * 5), model)

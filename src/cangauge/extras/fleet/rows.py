@@ -25,7 +25,6 @@ from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.diagnosis import Healthy
-    from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
 
 Answer = Literal["estimate", "gap", "judge"]
@@ -89,25 +88,18 @@ def _estimated(job: FleetJob, path: Path) -> Mapping[str, Any]:
 
 def _diagnosed(job: FleetJob, path: Path) -> Mapping[str, Any]:
     from cangauge.diagnosis import diagnose
+    from cangauge.logs.charge import refuse_contradictions
 
-    return diagnose([_log(job, path)], _model(job.model), _learned(job)).to_json()
+    log, model = job.reading.load(path), _model(job.model)
+    refuse_contradictions([log], model.capacity_ah)
+    return diagnose([log], model, _learned(job)).to_json()
 
 
 def _judged(job: FleetJob, path: Path) -> Mapping[str, Any]:
     from cangauge.extras.judge.judgement import judge
 
-    log = _log(job, path)
-    cells = [job.reading.cells_of(log)]
-    return judge([log], _model(job.model), cell_voltages=cells).to_dict()
-
-
-def _log(job: FleetJob, path: Path) -> Log:
-    """Return a log; InputError where its charge and SoC contradict each other, as the commands."""
-    from cangauge.logs.charge import refuse_contradictions
-
     log = job.reading.load(path)
-    refuse_contradictions([log], _model(job.model).capacity_ah)
-    return log
+    return judge([log], _model(job.model), cell_voltages=[job.reading.cells_of(log)]).to_dict()
 
 
 @lru_cache(maxsize=1)

@@ -42,17 +42,6 @@ WANDER_S: Final = 1200.0
 """Time over which the level of the voltage also wanders [s]: the curve's features pass by, and the
 pack warms up."""
 
-FULL_H: Final = 1.0 / 12.0
-"""Least time for which a full charge holds its voltage [h], …"""
-FULL_C_RATE: Final = 0.05
-"""… with less current than this at its end [1/h], of either sign since the sensor may be off, or
-with half of the current that it began with, …"""
-KNEE_PCT: Final = 99.5
-"""… above the curve at this SoC [%], where it has turned up towards full: the model's and the
-typical cell's, since a fit whose logs never reached the top has no knee."""
-SAME_CHARGE_PCT: Final = 2.0
-"""Charge drawn after which a charge is another one [%]: clouds interrupt one."""
-
 SENSORS: Final = ("current_offset", "voltage_gain", "capacity")
 """Effects of the model library that the log, or the pack, may have."""
 
@@ -133,7 +122,7 @@ class Chain:
 
     def __init__(self, logs: Sequence[Log], model: Model) -> None:
         self.model, self.extended = model, model.extended_model()
-        self.functions = model.functions
+        self.functions, noise = model.functions, model.noise
         cuts, parts = list[tuple[int, slice, bool]](), list[Samples]()
         for number, log in enumerate(logs):
             step_pct = resolution_pct(log)
@@ -147,18 +136,17 @@ class Chain:
                 cure=f"give logs of at least {SHORTEST_S / 60.0:.0f} minutes, better half an hour"
                 " with changing load",
             )
-        for number, (before, after) in enumerate(pairwise(known), start=1):
+        for part, before, after in zip(parts[1:], known, known[1:], strict=False):
             # A limit ends a piece also where it ends a log.
-            parts[number].is_cut[0] |= bool(is_limit(np.append(before[-1:], after[:1])).any())
+            part.is_cut[0] |= bool(is_limit(np.append(before[-1:], after[:1])).any())
         self.samples = samples = Samples(*map(np.concatenate, zip(*parts, strict=True)))
         piece = np.cumsum(samples.is_cut)
         self.row_piece = np.where(np.isfinite(samples.count_pct), piece, -1)
-        block_h = model.noise.block_s / 3600.0
-        block = np.floor(samples.hours / block_h)
-        parted = np.diff([samples.stretch, block, piece], prepend=-1.0)
+        block_h = noise.block_s / 3600.0
+        parted = np.diff([samples.stretch, np.floor(samples.hours / block_h), piece], prepend=-1.0)
         first = np.flatnonzero(parted.any(axis=0))
         every = _means(samples, first)
-        used, is_full = _used(every, len(cuts), model)
+        used, is_full = _used(every, len(parts), model)
         of_used: list[Any] = [each[used] for each in every]
         self.blocks = blocks = Samples(*of_used)
         # The delay line fills.
@@ -169,7 +157,7 @@ class Chain:
             Stretch(log, rows, _places(samples.stretch, k), _places(blocks.stretch, k), continues)
             for k, (log, rows, continues) in enumerate(cuts)
         ]
-        self.fitting_pct, noise = self._fitting(), model.noise
+        self.fitting_pct = self._fitting()
         growth = np.maximum(1.0, resistance_factor(blocks.temperature_c))
         self._cold = np.asarray(growth**noise.cold_exponent)
         self._axis_v = noise.soc_std_pct * self.slope(self.fitting_pct)
@@ -308,12 +296,15 @@ def _means(samples: Samples, first: IntArray) -> Samples:
 def _used(blocks: Samples, stretches: int, model: Model) -> tuple[IntArray, BoolArray]:
     """Return the blocks that are used, and whether a charge has ended full at each of all.
 
-    It has where a high voltage was held until the current was gone.
+    It has where a high voltage was held for five minutes, until the current was below C/20, of
+    either sign since the sensor may be off, or half of what it was. High is above the curve at
+    99.5 %, where it has turned up towards full: the model's and the typical cell's, since a fit
+    whose logs never reached the top has no knee.
     """
-    knee_v = float(model.voltage_model().pseudo_ocv([KNEE_PCT])[0])
+    knee_v = float(model.voltage_model().pseudo_ocv([99.5])[0])
     if model.cells is not None:
         typical = CHEMISTRIES[model.chemistry].curve_v
-        knee_v = max(knee_v, model.cells * float(np.interp(KNEE_PCT, KNOTS_PCT, typical)))
+        knee_v = max(knee_v, model.cells * float(np.interp(99.5, KNOTS_PCT, typical)))
     used, is_full = [], np.zeros(blocks.hours.size, dtype=bool)
     for k in range(stretches):
         inside = _places(blocks.stretch, k)
@@ -322,12 +313,12 @@ def _used(blocks: Samples, stretches: int, model: Model) -> tuple[IntArray, Bool
         edges = inside.start + np.flatnonzero(np.diff(held, prepend=False, append=False))
         for first, end in edges.reshape(-1, 2):
             charge = -blocks.current_a[first:end]
-            is_small = abs(charge[-1]) < FULL_C_RATE * model.capacity_ah
-            is_long = blocks.hours[end - 1] - blocks.hours[first] >= FULL_H
-            if is_long and (is_small or charge[-1] < 0.5 * charge.max()):
+            is_small = abs(charge[-1]) < model.capacity_ah / 20.0 or charge[-1] < 0.5 * charge.max()
+            if is_small and blocks.hours[end - 1] - blocks.hours[first] >= 1.0 / 12.0:
                 ends.append(end - 1)
+        # Clouds interrupt a charge: after 2 % drawn it is another one.
         drawn_pct = np.diff(blocks.drawn_pct[ends], append=np.inf)
-        is_full[np.array(ends, dtype=np.intp)[drawn_pct >= SAME_CHARGE_PCT]] = True
-        stride = max(1, -(-(inside.stop - inside.start) // BLOCKS_AT_MOST))
+        is_full[np.array(ends, dtype=np.intp)[drawn_pct >= 2.0]] = True
+        stride = -(-(inside.stop - inside.start) // BLOCKS_AT_MOST)
         used += [*range(inside.start, inside.stop, stride), inside.stop - 1]
     return np.unique([*used, *np.flatnonzero(is_full)]), is_full

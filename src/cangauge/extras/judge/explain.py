@@ -41,6 +41,8 @@ follows the voltage, which counts nothing."""
 
 Part = tuple[FloatArray, FloatArray, FloatArray]
 """X, y and a root of the covariance of the noise of some rows."""
+Set = frozenset[int]
+"""Numbers of faults."""
 
 
 class Fitted(NamedTuple):
@@ -101,6 +103,7 @@ class Linearised:
         slope = chain.slope(soc_pct)
         error_v = chain.blocks.voltage_v - chain.voltage_v(soc_pct)
         error_v += slope * (soc_pct - self._counted_pct)
+        self._rows = dict[int | None, Rows]()
         self._pack = _total(self._pack_parts(slope, error_v, volts, varies))
 
     def _pack_parts(
@@ -142,69 +145,69 @@ class Linearised:
 
     def rows(self, gauge: int | None) -> Rows:
         """Return the rows of the pack, and of all counts at one of `GAUGES`; None: of none."""
-        table, log_norm = self._pack
-        if gauge is not None:
-            counts, of_counts = _total(self._gauge_parts(gauge))
-            table, log_norm = table + counts, log_norm + of_counts
-        # Shapes of faults may be alike: a little of each square keeps the matrix positive.
-        table = table + np.diag(1e-11 * (1.0 + np.diag(table)))
-        return Rows(np.asarray(np.linalg.cholesky(table).T, dtype=np.float64), log_norm)
-
-    @cached_property
-    def of_gauges(self) -> list[Rows]:
-        """Rows at each of `GAUGES`."""
-        return [self.rows(k) for k in range(len(GAUGES))]
+        if gauge not in self._rows:
+            table, log_norm = self._pack
+            if gauge is not None:
+                counts, of_counts = _total(self._gauge_parts(gauge))
+                table, log_norm = table + counts, log_norm + of_counts
+            # Shapes of faults may be alike: a little of each square keeps the matrix positive.
+            table = table + np.diag(1e-11 * (1.0 + np.diag(table)))
+            self._rows[gauge] = Rows(np.asarray(np.linalg.cholesky(table).T), log_norm)
+        return self._rows[gauge]
 
     @cached_property
     def _of_faults(self) -> list[Rows]:
         """Rows of the faults at each of `GAUGES`."""
-        return [rows.eliminated(self._n) for rows in self.of_gauges]
+        return [self.rows(k).eliminated(self._n) for k in range(len(GAUGES))]
 
-    def log_weights(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Return ln of the weight of a set of faults, and with each other fault added to it.
+    def neighbourhood(self, chosen: Set) -> dict[Set, FloatArray]:
+        """Return ln weights, over `GAUGES`, of a set and of all that differ from it by one fault.
 
-        Returns
-        -------
-        base : array of shape (gauges,)
-        more : array of shape (gauges, faults)
-            −∞ for other shapes of those in the set.
+        Those of no fault and of one alone are always among them.
         """
-        log_prior = np.array([fault.log_prior for fault in self.faults])
+        found = dict[Set, FloatArray]()
+        for left in ((), chosen, *(chosen - {one} for one in sorted(chosen))):
+            found |= self._weights(sorted(left))
+        return found
+
+    def _weights(self, chosen: Sequence[int]) -> dict[Set, FloatArray]:
+        """Return ln weights, over `GAUGES`, of a set, and with each other fault added to it."""
         taken = {self.faults[k].place for k in chosen}
-        others = np.array(
-            [k for k, fault in enumerate(self.faults) if fault.place not in taken], dtype=np.intp
-        )
-        is_positive = np.array([not any(FAULTS[self.faults[k].fault].sides) for k in others], bool)
+        others = [k for k, fault in enumerate(self.faults) if fault.place not in taken]
+        is_signed = [any(FAULTS[self.faults[k].fault].sides) for k in others]
+        log_prior = np.array([fault.log_prior for fault in self.faults])
         std = self._std[self._n :]
-        prior = Rows.prior(std[list(chosen)], others=others.size)
-        base, more = [], np.full((len(GAUGES), len(self.faults)), -np.inf)
-        for k, rows in enumerate(self._of_faults):
+        prior = Rows.prior(std[list(chosen)], others=len(others))
+        weights = []
+        for rows in self._of_faults:
             given = rows.with_columns([*chosen, *others]) + prior
             added = given.added(len(chosen), std[others])
-            base.append(added.log_evidence + float(log_prior[list(chosen)].sum()))
+            base = added.log_evidence + log_prior[list(chosen)].sum()
             size = added.mean / std[others]
-            is_sound = (np.abs(size) <= BEYOND) & ((size > 0.0) | ~is_positive)
-            gain = np.where(is_sound, added.log_factor, -np.inf)
-            more[k, others] = base[k] + gain + log_prior[others]
-        return np.array(base), more
+            is_sound = (np.abs(size) <= BEYOND) & ((size > 0.0) | is_signed)
+            more = np.where(is_sound, base + added.log_factor + log_prior[others], -np.inf)
+            weights.append([base, *more])
+        sets = [frozenset(chosen), *(frozenset([*chosen, k]) for k in others)]
+        return {
+            each: weight
+            for each, weight in zip(sets, np.array(weights).T, strict=True)
+            if np.isfinite(weight).any()
+        }
 
-    def fitted(
-        self, chosen: Sequence[int], rows: Rows, share: float = 1.0, *, is_counter: bool = True
-    ) -> Fitted:
-        """Return the posterior of a set of faults of a probability."""
-        chain, zero = self._chain, len(chosen) + self._chain.functions.number
+    def fitted(self, chosen: Sequence[int], gauge: int | None, share: float = 1.0) -> Fitted:
+        """Return the posterior of a set of faults of a probability at one of `GAUGES`."""
         of = [*(self._n + k for k in chosen), *range(self._n)]
         prior = Rows.prior(self._std[of[: len(chosen)]], others=self._n)
-        posterior = (rows.with_columns(of) + prior).posterior()
-        X = self._S[:, of]
+        posterior = (self.rows(gauge).with_columns(of) + prior).posterior()
+        X, zero = self._S[:, of], len(chosen) + self._chain.functions.number
         pack_pct = self._counted_pct + X @ posterior.mean
         std_pct = [
             np.linalg.norm(X[each.blocks] @ posterior.root + posterior.root[zero], axis=1)
-            for each in chain.stretches
+            for each in self._chain.stretches
         ]
         return Fitted(
             share,
-            is_counter,
+            gauge != len(GAUGES) - 1,
             self.is_free(chosen),
             tuple(self.faults[k] for k in chosen),
             posterior,
@@ -254,43 +257,24 @@ def explain(chain: Chain, known: Mapping[str, float]) -> list[Fitted]:
     Each set is weighed at its own; its neighbours count with their probabilities.
     """
     soc_pct = _settled(chain, known, chain.fitting_pct)
-    best = frozenset[int]()
-    seen = set[frozenset[int]]()
+    best, seen = Set(), set[Set]()
     while best not in seen:
         seen.add(best)
         at = Linearised(chain, known, soc_pct)
-        weights = _neighbourhood(at, sorted(best))
+        weights = at.neighbourhood(best)
         totals = [logsumexp(of_gauges) for of_gauges in weights.values()]
         best = list(weights)[int(np.argmax(totals))]
         if best not in seen:
             soc_pct = _settled(chain, known, soc_pct, sorted(best), int(np.argmax(weights[best])))
-    log_total = logsumexp(totals)
     fits = []
     for is_free in (False, True):
         some = {chosen: each for chosen, each in weights.items() if at.is_free(chosen) == is_free}
         most = max((float(each.max()) for each in some.values()), default=0.0)
         for chosen, of_gauges in some.items():
             for gauge in np.flatnonzero(of_gauges >= most + np.log(0.003)).tolist():
-                share = float(np.exp(of_gauges[gauge] - log_total))
-                is_counter = gauge < len(GAUGES) - 1
-                fits.append(
-                    at.fitted(sorted(chosen), at.of_gauges[gauge], share, is_counter=is_counter)
-                )
+                share = float(np.exp(of_gauges[gauge] - logsumexp(totals)))
+                fits.append(at.fitted(sorted(chosen), gauge, share))
     return sorted(fits, key=attrgetter("share"), reverse=True)
-
-
-def _neighbourhood(at: Linearised, chosen: Sequence[int]) -> dict[frozenset[int], FloatArray]:
-    """Return ln weights, over `GAUGES`, of a set and of all that differ from it by one fault.
-
-    Those of no fault and of one alone are always among them.
-    """
-    found = dict[frozenset[int], FloatArray]()
-    for left in ([], chosen, *([j for j in chosen if j != one] for one in chosen)):
-        base, more = at.log_weights(left)
-        found[frozenset(left)] = base
-        for j in np.flatnonzero(np.isfinite(more).any(axis=0)).tolist():
-            found[frozenset([*left, j])] = more[:, j]
-    return found
 
 
 def _settled(
@@ -304,10 +288,9 @@ def _settled(
 
     With the gauge withheld all of the voltage's errors may vary.
     """
-    varies = 1.0 if gauge is None else VARIES
     for _ in range(8):  # a part of the way each, as the slope jumps between features of a curve
-        at = Linearised(chain, known, soc_pct, chosen, varies)
-        found = at.fitted(range(len(chosen)), at.rows(gauge)).pack_pct
+        at = Linearised(chain, known, soc_pct, chosen, 1.0 if gauge is None else VARIES)
+        found = at.fitted(range(len(chosen)), gauge).pack_pct
         step = np.clip(found, -3.0, 103.0) - soc_pct
         if np.abs(step).max() < 0.1:
             break

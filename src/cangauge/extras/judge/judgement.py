@@ -203,17 +203,10 @@ def _verdict(chain: Chain, last: Piece) -> Verdict:
 
     if last.stands_at_pct is not None or within(OFF_PCT) <= 0.05:
         return "off"
-    return "agrees" if within(AGREES_PCT) >= NAMED and not _may_stand(chain) else "cannot_tell"
-
-
-def _may_stand(chain: Chain) -> bool:
-    """Return whether the gauge has not moved at the end where a dashboard would have shown it."""
-    samples = chain.samples
-    known = np.flatnonzero(np.isfinite(samples.shown_pct))
-    shown = samples.shown_pct[known]
-    same = known[np.max(np.flatnonzero(shown != shown[-1]), initial=-1) + 1 :]
-    _, first = np.unique(samples.stretch[same], return_index=True)
-    return bool(stands(samples.held_pct[same[first]].sum(), samples.step_pct[known[-1]], JUMP_PCT))
+    # It may stand still where it has not moved, and a dashboard would have shown that it does.
+    row = int(np.flatnonzero(np.isfinite(chain.samples.shown_pct))[-1])
+    may_stand = stands(chain.samples.held_pct[row], chain.samples.step_pct[row], JUMP_PCT)
+    return "agrees" if within(AGREES_PCT) >= NAMED and not may_stand else "cannot_tell"
 
 
 def _of_logs(chain: Chain, logs: Sequence[Log], values: FloatArray) -> list[FloatArray]:

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from scipy.special import expit, logit
-from scipy.stats import median_abs_deviation
+from scipy.special import expit, logit, logsumexp
+from scipy.stats import median_abs_deviation, norm
 
 from cangauge._typing import FloatArray
 from cangauge.extras.judge.chain import Chain
@@ -70,9 +70,9 @@ def weakest_cell(
     kind = FAULTS["weak_cell"]
     (prior_std,) = kind.stds
     wide = np.hypot(spread, prior_std)
-    factors = 0.5 * lack**2 * (spread**-2 - wide**-2) - np.log(wide / spread)
+    factors = norm.logpdf(lack, scale=wide) - norm.logpdf(lack, scale=spread)
     factors = np.where(lack > 0.0, factors + np.log(2.0), -np.inf)
-    log_factor = float(np.logaddexp.reduce(factors) - np.log(lack.size))
+    log_factor = logsumexp(factors) - np.log(lack.size)
     weakest = int(np.argmax(lack))
     gain = prior_std**2 / (prior_std**2 + spread**2)
     size = gain * float(lack[weakest])
