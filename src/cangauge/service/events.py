@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from operator import attrgetter
 from typing import IO, Final, Literal, TextIO
 
 from cangauge._text import plain, printable, printable_json
@@ -22,8 +23,6 @@ FIRST_INTERVAL_S: Final = 1.0
 """Minimum time between the first two records of an event [s]; doubles with each repetition …"""
 LONGEST_INTERVAL_S: Final = 60.0
 """… up to this [s]. An event that was quiet for longer starts again at the first interval."""
-EVENTS_KEPT: Final = 256
-"""Most events whose repetitions are tracked, to bound the memory."""
 
 
 @dataclass(slots=True)
@@ -35,10 +34,6 @@ class _Repetitions:
     interval_s: float = 0.0
     suppressed: int = 0
     held: logging.LogRecord | None = None
-
-
-def _created(held: tuple[_Repetitions, logging.LogRecord]) -> float:
-    return held[1].created
 
 
 class RateLimitedHandler(logging.StreamHandler[TextIO]):
@@ -76,8 +71,8 @@ class RateLimitedHandler(logging.StreamHandler[TextIO]):
         with self.lock:  # type: ignore[union-attr] # made by Handler
             now_s = self._clock()
             event = self._events[key] = self._events.pop(key, _Repetitions())
-            if len(self._events) > EVENTS_KEPT:
-                del self._events[next(iter(self._events))]  # the one quiet for longest
+            if len(self._events) > 256:  # bounds the memory: the one quiet for longest goes
+                del self._events[next(iter(self._events))]
             if now_s - event.latest_s > LONGEST_INTERVAL_S:
                 event.interval_s = 0.0
             event.latest_s = now_s
@@ -92,11 +87,11 @@ class RateLimitedHandler(logging.StreamHandler[TextIO]):
         """Write the suppressed records whose interval has ended, or all of them."""
         with self.lock:  # type: ignore[union-attr] # made by Handler
             now_s = self._clock()
-            held = [(each, each.held) for each in self._events.values() if each.held is not None]
-            for event, record in sorted(held, key=_created):
-                if everything or now_s >= event.next_s:
+            held = [each for each in self._events.values() if each.held is not None]
+            for event in sorted(held, key=attrgetter("held.created")):
+                if event.held is not None and (everything or now_s >= event.next_s):
                     event.suppressed -= 1
-                    self._write(event, record, now_s)
+                    self._write(event, event.held, now_s)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record; drop it if the stream's reader has stopped."""

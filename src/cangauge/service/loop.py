@@ -32,8 +32,6 @@ _warn = partial(emit, _LOG, logging.WARNING)
 
 LATE_S: Final = 0.01
 """Longest time that due frames wait for a sample to arrive [s]."""
-LOGGED_FROM_S: Final = 1.0
-"""Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
 NEVER_SEEN_S: Final = 60.0
 """Time after which a signal that never came is logged [s]: replies are asked for once a minute."""
 FIRST_CHECKPOINT_S: Final = 1.0
@@ -275,7 +273,7 @@ class Loop:
         """Let the pipeline follow a step of the stamps' clock, and log it."""
         step_s = self._pipeline.stamp_shift_s - self._stamps.shift_s
         self._pipeline.stamp_shift_s = self._stamps.shift_s
-        if abs(step_s) >= LOGGED_FROM_S:
+        if abs(step_s) >= 1.0:  # smaller ones are the clock's drift
             text = f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
             _warn("bus.clock_set", f"{text} the monotonic clock", step_s=step_s)
 

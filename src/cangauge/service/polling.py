@@ -26,10 +26,6 @@ SLOWEST_S: Final = 60.0
 OTHER_TESTER_S: Final = 30.0
 """Silence of another tester after which requests are sent again [s]: drivers' apps ask often."""
 
-_NEGATIVE, _RESPONSE_PENDING = 0x7F, 0x78
-_CONTINUE: Final = bytes([0x30, 0x00, 0x00])
-"""Flow control: continue to send, all frames, without a pause."""
-
 
 class Poller:
     """Requests for replies in turn, one at a time; all times are monotonic [s].
@@ -104,15 +100,17 @@ class Poller:
             is_ours = kind == FIRST and message.data[2:].startswith(target.reply)
             if is_ours and self._may_continue:  # once: a node may repeat its first frame for ever
                 self._may_continue = False
-                return _frame(target.request_id, _CONTINUE)
+                # Flow control: continue to send, all frames, without a pause.
+                return _frame(target.request_id, bytes([0x30, 0x00, 0x00]))
         elif reply.startswith(target.reply):
             self.counts["answers"] += 1
             self._end(target, now_s, failed=False)
-        elif reply[:3] == bytes([_NEGATIVE, target.request[0], _RESPONSE_PENDING]):
-            self._give_up_s = self._exchange_ends_s
-        elif reply[:2] == bytes([_NEGATIVE, target.request[0]]):
-            self.counts["negative"] += 1
-            self._end(target, now_s, failed=True)
+        elif reply[:2] == bytes([0x7F, target.request[0]]):
+            if reply[2:3] == b"\x78":  # response pending
+                self._give_up_s = self._exchange_ends_s
+            else:
+                self.counts["negative"] += 1
+                self._end(target, now_s, failed=True)
         return None
 
     def note_other_tester(self, now_s: float) -> None:

@@ -40,7 +40,6 @@ COUNTED: Final = {
     "foreign": "frames of another service with these ids",
 }
 """Words for the counts of a bus, at the end of a run."""
-_OF_THE_VEHICLE: Final = {"vehicle", "dbc", "map", "temperature", "pair_within_s"}
 _LOG = logging.getLogger(__name__)
 
 
@@ -290,21 +289,17 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path
 
 
 def _log_changes(old: Setup, new: Setup) -> None:
-    before, after = old.config.model_dump(), new.config.model_dump()
-    changed = [name for name in after if after[name] != before[name]]
-    if old.vehicle != new.vehicle and not _OF_THE_VEHICLE & set(changed):
-        changed.append("content of map or DBC")
-    if old.model != new.model and "model" not in changed:
-        changed.append("content of the model")
+    before, after, keys = old.config.model_dump(), new.config.model_dump(), config_keys()
+    names = [name for name in keys if value_at(before, name) != value_at(after, name)]
+    files = {
+        "content of map or DBC": old.vehicle != new.vehicle,
+        "content of the model": old.model != new.model,
+    }
+    changed = [*names, *(name for name, is_other in files.items() if is_other)]
     text = f"configuration reloaded; changed: {', '.join(changed) or 'nothing'}"
     if old.vehicle.battery != new.vehicle.battery:
         text += "; current or voltage are decoded otherwise: the SoC starts anew from the voltage"
     emit(_LOG, logging.INFO, "config.reloaded", text)
-    late = ", ".join(
-        name
-        for name, key in config_keys().items()
-        if key["restart"] and value_at(before, name) != value_at(after, name)
-    )
-    if late:
+    if late := ", ".join(name for name in names if keys[name]["restart"]):
         text = f"{late}: takes effect after a restart of the service"
         emit(_LOG, logging.WARNING, "config.needs_restart", text)

@@ -41,8 +41,6 @@ from cangauge.service.worker import CLOSE_WITHIN_S, Worker
 STATE_FORMAT: Final = "cangauge-state"
 STATE_VERSION: Final = 6
 """To be increased with every change of the content."""
-LARGEST_BYTES: Final = 8 << 20
-"""Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
 FILE_NAME: Final = "cangauge-state.json"
 """Name of the file in a folder."""
 REBOOT_S: Final = 600.0
@@ -244,7 +242,7 @@ def read_state(path: Path) -> StateContent:
     InputError
         If there is none, or it cannot be read, is damaged, or has another version.
     """
-    raw = read_bounded(path, LARGEST_BYTES, "a state file")
+    raw = read_bounded(path, 8 << 20, "a state file")  # a full delay line takes 0.3 MB
     try:
         data = json.loads(raw.decode("utf-8"))
         content = data["content"]

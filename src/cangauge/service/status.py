@@ -19,7 +19,7 @@ from cangauge._text import known_soc, plain
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.plausibility import Count
-from cangauge.bus.publish import NO_REPORT
+from cangauge.bus.publish import DETAIL_EVERY, ESTIMATE_EVERY_S, NO_REPORT
 from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
@@ -38,8 +38,9 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
-NOTIFY_EVERY_S: Final = 1.0
-"""Interval of status lines to systemd, and of health, power and cells in the snapshots [s]."""
+NOTIFY_EVERY_S: Final = DETAIL_EVERY * ESTIMATE_EVERY_S
+"""Interval of status lines to systemd, and of health, power and cells in the snapshots, as on the
+bus [s]."""
 RATE_OVER_S: Final = 2.0
 """Averaging time of the sample rate [s]."""
 CLOCKS_APART_S: Final = 60.0

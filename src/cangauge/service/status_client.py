@@ -51,7 +51,6 @@ BOUNDS_S: Final = (
 """Upper bounds of the buckets of a histogram [s]; one more bucket holds larger values."""
 ANSWER_WITHIN_S: Final = 3.0
 """Longest wait for an answer [s]."""
-LARGEST_ANSWER: Final = 1 << 20
 SEND_WITHIN_S: Final = 0.5
 """Longest wait for a client that does not read [s]; the next one waits as long."""
 SYSTEM_FOLDER: Final = Path("/run/cangauge")
@@ -238,7 +237,7 @@ def fetch_status(path: Path) -> dict[str, Any]:
     answer, until_s = b"", time.monotonic() + ANSWER_WITHIN_S
     try:
         with _connected(path) as connection:
-            while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
+            while len(answer) < 1 << 20 and (part := connection.recv(1 << 16)):
                 answer += part
                 connection.settimeout(max(until_s - time.monotonic(), 1e-3))
     except OSError as error:

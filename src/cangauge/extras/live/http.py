@@ -75,9 +75,12 @@ class Site(Output):
     ----------
     cookie : str or None
         Cookie that is as good as the token.
+    latest : Snapshot or None
+        None before the first.
     """
 
     cookie: str | None = None
+    latest: Snapshot | None = None
 
     def __init__(
         self, address: HttpAddress, title: str, routes: Routes, *, keeps_alive: bool = False
@@ -110,6 +113,10 @@ class Site(Output):
         text = f"{title.format(replace(address, port=port))}, {access}"
         emit(_LOG, logging.INFO, f"{address.key}.listening", text, port=port)
 
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Make a snapshot the latest one."""
+        self.latest = snapshot
+
     def check_token(self, header: str, peer: str, wrong_at_most: int) -> bool:
         """Return whether an Authorization header bears the token; takes the same time for each.
 
@@ -133,18 +140,6 @@ class Site(Output):
 
 def _log_nothing(_handler: RequestHandler) -> None:
     """Log no request: a client could fill the disk."""
-
-
-class StatusServer(Site):
-    """Serve snapshots; `latest` is None before the first."""
-
-    def __init__(self, address: HttpAddress) -> None:
-        self.latest: Snapshot | None = None
-        super().__init__(address, "status: http://{}/status", {"/(.*)": (StatusPage, True)})
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Make a snapshot the latest one."""
-        self.latest = snapshot
 
 
 class _Server(HTTPServer):
@@ -255,6 +250,9 @@ class StatusPage(Handler):
         body, content_type = render(status, self.request.headers.get("Accept", ""))
         self.set_header("Content-Type", content_type)
         self.finish(body)
+
+
+STATUS: Final[Routes] = {"/(.*)": (StatusPage, True)}
 
 
 def to_json(content: dict[str, Any]) -> str:

@@ -52,9 +52,9 @@ def outputs_of(config: RunConfig, bus: str) -> list[Output]:
     outputs: list[Output] = []
     addresses = http_addresses(config)
     if (address := addresses.get("http")) is not None:
-        from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
+        from cangauge.extras.live.http import STATUS, Site  # noqa: PLC0415
 
-        outputs.append(StatusServer(address))
+        outputs.append(Site(address, "status: http://{}/status", STATUS))
     if (address := addresses.get("dashboard")) is not None:
         from cangauge.extras.live.server import LivePage  # noqa: PLC0415
 
