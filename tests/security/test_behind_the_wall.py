@@ -149,7 +149,7 @@ def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: P
         (folder / "junk.parquet").write_bytes(b"PAR1")
         ten_minutes(judge)
         judge._end_stretch()
-        assert waits(lambda: len(list(folder.glob("2*.parquet"))) == 1)
+        assert waits(lambda: len(list(folder.glob("0*.parquet"))) == 1)
 
 
 def test_a_battery_that_publishes_no_soc_leaves_a_log_that_can_be_read(tmp_path: Path) -> None:
