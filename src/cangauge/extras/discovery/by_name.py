@@ -75,14 +75,8 @@ _JOINED: Final = re.compile(f"(?:{_KNOWN.pattern})++")
 _HIGH_V: Final = 65.536
 """Range of a signal beyond which it is of a high voltage (over 60 V): 16 bits of a millivolt, with
 which batteries of 12–48 V are measured."""
-_CLEARLY: Final = 1.0
-"""Distance in score of the first signal that makes it clear: one matching word."""
-_FOLLOWED: Final = 2.0
-"""What the physics is worth at most: two matching words."""
 PROVEN: Final = 0.5
 """Share of a voltage's changes by a current from which on the two need no names."""
-_WEIGHED: Final = 8
-"""Likeliest currents and voltages by name whose pairs are tried."""
 _CODES_APART: Final = 1.0 / 16.0
 """Least distance of a code from the measured numbers, as a share of the signal's range."""
 
@@ -297,9 +291,12 @@ def _weighed(
     voltages: Sequence[Candidate],
     signals: Mapping[tuple[str, str], _NamedSignal],
 ) -> list[list[Candidate]]:
-    """Add the physics to the scores of the likeliest currents and voltages by name."""
+    """Add the physics to the scores of the eight likeliest currents and voltages by name.
+
+    It is worth two matching words at most.
+    """
     both = (currents, voltages)
-    i, u = ([signals[c.message, c.signal] for c in each[:_WEIGHED]] for each in both)
+    i, u = ([signals[c.message, c.signal] for c in each[:8]] for each in both)
     shares = np.array([[_followed(one, other) for other in u] for one in i])
     weighed = []
     for axis, candidates in enumerate(both):
@@ -307,7 +304,7 @@ def _weighed(
         proven = [
             replace(
                 each,
-                score=each.score + _FOLLOWED * round(4.0 * share) / 4.0,  # equal of equal packs
+                score=each.score + 2.0 * round(4.0 * share) / 4.0,  # equal of equal packs
                 evidence=share,
                 against=() if share > PROVEN else each.against,
             )
@@ -357,7 +354,7 @@ def _followed(current: _NamedSignal, voltage: _NamedSignal) -> float:
 
 
 def clear_roles(found: Mapping[str, Sequence[Candidate]]) -> list[str]:
-    """Return the roles whose first signal is clearly the pack's own.
+    """Return the roles whose first signal is clearly the pack's own: by one matching word.
 
     Sensors in one message measure one part; a SoC that stands still shows no battery at work.
     """
@@ -368,7 +365,7 @@ def clear_roles(found: Mapping[str, Sequence[Candidate]]) -> list[str]:
         if not candidates:
             continue
         first, *others = candidates
-        near = [each for each in others if first.score - each.score < _CLEARLY]
+        near = [each for each in others if first.score - each.score < 1.0]
         if role == "temperature":
             is_packs = first.message in pack or bool(_words_of(first.name) & _BATTERY)
             is_clear = is_packs and all(each.message == first.message for each in near)

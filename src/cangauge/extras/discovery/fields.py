@@ -28,9 +28,6 @@ LEAST_BITS: Final = 8
 MOST_BITS: Final = 16
 MIN_FRAMES: Final = 12
 """Fewest frames of an id that can show how its bits move."""
-STEADY: Final = 0.55
-"""Least share of equal steps of an alive counter. A capture that loses a quarter of its frames
-still has 0.75."""
 MULTIPLEXED: Final = 0.4
 """Largest ratio of the changes among frames of one multiplexer value to those of all frames."""
 LINK_EVENTS: Final = 4
@@ -350,15 +347,16 @@ def _counters_and_crcs(payload: NDArray[np.uint8]) -> BoolArray:
 
 def _counts(codes: NDArray[np.int64], modulus: int) -> bool:
     """Whether codes step by the same number nearly always, through all values."""
+    steady = 0.55  # of a capture that loses a quarter of its frames, 0.75 of the steps are equal
     steps = np.bincount(np.diff(codes) % modulus, minlength=modulus)
-    if steps[1:].max(initial=0) <= STEADY * steps.sum():
+    if steps[1:].max(initial=0) <= steady * steps.sum():
         return False
     uses = np.bincount(codes, minlength=modulus)
     if modulus > 16:
         # A nibble of something else above a counter does not step as the counter wraps.
         wraps = np.flatnonzero(np.diff(codes % 16) < 0)
         carries = np.diff(codes)[wraps] % modulus == int(steps[1:].argmax()) + 1
-        if not len(wraps) or carries.mean() < STEADY:
+        if not len(wraps) or carries.mean() < steady:
             return False
     return bool((uses > 0).sum() >= modulus - 1 and uses.max() < 2.5 * len(codes) / modulus)
 

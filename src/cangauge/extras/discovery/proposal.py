@@ -16,8 +16,6 @@ from cangauge.extras.discovery.candidate import ROLES, Candidate, Level, short_n
 
 FALLBACK_C: Final = 20.0
 """Temperature of a map without one [°C]: the reference temperature of the voltage model."""
-PAIR_S: Final = (0.020, 0.1, 1.0)
-"""Least, usual and largest distance of paired current and voltage in a map [s]."""
 
 
 @dataclass
@@ -160,10 +158,9 @@ class Proposal:
                 if role not in self.chosen and (found := self.candidates[role]):
                     named = ", ".join(f"{each.name} ({each.range_text})" for each in found)
                     head = (*head, f"Not clear, so not used, {ROLES[role].column}: {named}.")
-        least_s, pair_s, most_s = PAIR_S
         period_s = max(self.signals[role].period_s for role in ("current", "voltage"))
-        if not math.isnan(period_s):  # as of a DBC without a capture
-            pair_s = min(max(least_s, 1.2 * period_s), most_s)
+        # A DBC without a capture has no periods.
+        pair_s = 0.1 if math.isnan(period_s) else min(max(0.02, 1.2 * period_s), 1.0)
         yield from map(_comment, head)
         yield f"""
 dbc = {_toml(dbc)}

@@ -56,8 +56,6 @@ BETWEEN_S: Final = 10.0
 """Pause that is put between captures [s]: as long as trends that the search takes away."""
 ENOUGH_NATS: Final = 3.0
 """Evidence that is needed to decide without the user: a likelihood ratio of 20."""
-MOVES: Final = 5
-"""Steps of a current, each a tenth of its range, without which nothing proves it."""
 
 
 def search(
@@ -118,8 +116,8 @@ def search(
 
 
 def _is_proven(candidate: Candidate) -> bool:
-    """Return whether the voltage follows steps of the current."""
-    return candidate.evidence >= ENOUGH_NATS and candidate.moves >= MOVES
+    """Return whether the voltage follows five steps of the current, each a tenth of its range."""
+    return candidate.evidence >= ENOUGH_NATS and candidate.moves >= 5
 
 
 def _is_clear(found: list[Candidate]) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -83,7 +82,6 @@ def twin_command(
     from cangauge.logs.canonical import write_log
 
     check_outputs([output], [])
-    began = time.perf_counter()
     with progress() as show:
         show("simulating")
         simulated = simulate(
@@ -98,7 +96,7 @@ def twin_command(
     for text in simulated.notes:
         note(text)
     write_log(simulated.log, output)
-    result = {**simulated.to_dict(), "seconds": time.perf_counter() - began}
+    result = simulated.to_dict()
     finish(result, partial(_show, result), {"log": output}, as_json=json_output)
 
 

@@ -110,7 +110,8 @@ def respond(
         I = I + load.size * load.is_active(time_s)
     cells, capacity, resistance, shift = _groups(pack, faults)
     counted = np.where(I < 0.0, (1.0 - size_of(faults, "coulombic_efficiency")) * I, I)
-    drawn = integral(counted, drive.step_s) / 3600.0 / pack.capacity_ah
+    integral = np.append(0.0, np.cumsum(0.5 * (counted[1:] + counted[:-1]))) * drive.step_s
+    drawn = integral / 3600.0 / pack.capacity_ah
     start = drive.start_soc + size_of(faults, "initial_soc") / 100.0
     z = (start + shift)[:, None] - drawn / capacity[:, None]
 
@@ -199,11 +200,6 @@ def _kinetics(
     x = np.sinh(np.linspace(-6.0, 6.0, 1201)) / np.sinh(6.0) * 30.0
     ratio = np.exp(pack.anodic * x) - np.exp(-(1.0 - pack.anodic) * x)
     return np.asarray(np.interp(I / I0, ratio, x) * 8.617333e-5 * T)  # R/F [V/K]
-
-
-def integral(signal: FloatArray, step_s: float) -> FloatArray:
-    """Return the integral of a signal from its first row on [its unit × s], shape (n,)."""
-    return np.concatenate(([0.0], np.cumsum(0.5 * (signal[1:] + signal[:-1])))) * step_s
 
 
 def relax(signal: FloatArray, step_s: float, tau_s: FloatArray) -> FloatArray:
