@@ -21,7 +21,7 @@ def start_thread(run: Callable[[], object], name: str) -> threading.Thread:
     try:
         thread.start()
     except RuntimeError as error:
-        cure = "raise the limit of threads (ulimit -u, TasksMax=)"
+        cure = "raise the limit of threads (ulimit -u, TasksMax=) or memory (ulimit -v)"
         raise CangaugeError(f"{name}: {error}; {cure}") from error
     return thread
 
