@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from cangauge._files import file_sha256, text_sha256
-from cangauge.diagnosis.evidence import Evidence, Quantity
+from cangauge.diagnosis.evidence import Evidence
 from cangauge.diagnosis.posterior import Posterior
 from cangauge.diagnosis.text import FAULT
 from cangauge.diagnosis.where import closed_part
@@ -84,28 +84,23 @@ def _fault(found: Diagnosis, fault: str) -> dict[str, Any]:
 
 
 def _effect(evidence: Evidence, posterior: Posterior) -> dict[str, Any]:
-    effect = evidence.shape.effect.id
+    effect, fault = evidence.shape.effect.id, evidence.fault
     return {
-        "fault": evidence.fault,
-        "probability": posterior.faults[evidence.fault],
+        "fault": fault,
+        "probability": posterior.faults[fault],
         "effect": effect,
         "effect_probability": posterior.probabilities[effect],
-        "parameters": {name: _plain(item) for name, item in evidence.parameters.items()},
+        "parameters": {name: dict(vars(item)) for name, item in evidence.parameters.items()},
     }
-
-
-def _plain(item: Quantity) -> dict[str, Any]:
-    return {"value": item.value, "ci": item.ci and list(item.ci), "unit": item.unit}
 
 
 def _step(found: Diagnosis) -> dict[str, Any] | None:
     if found.next_step is None:
         return None
     fault, before, after = found.next_step
-    first, second = (*found.posterior.stated, None)[:2]
     return {
         "measurement": FAULT[fault]["measurement"],
-        "between": [first, second],
+        "between": [*found.posterior.stated, None][:2],
         "probability_now": before,
         "probability_after": after,
     }

@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
+from cangauge._typing import FloatArray
 from cangauge.diagnosis import text
 from cangauge.diagnosis.as_json import as_json
 from cangauge.diagnosis.checks import check_logs
@@ -124,7 +125,7 @@ class Diagnosis:
         """The correction by the most probable stated fault that makes left-out errors smaller."""
         for fault in self.posterior.stated:
             found = self.corrections[fault]
-            if found.is_better and (found.is_of_log or self._keeps_soc(found)):
+            if found.is_better and self._keeps_soc(found):
                 return found
         return None
 
@@ -160,10 +161,9 @@ class Diagnosis:
         if "start" in self.posterior.stated:
             return None
         before = self._soc_error_pct(self.model)
-        if before is None:
+        if math.isnan(before):
             return None
-        after = self._soc_error_pct(self.extended_model) if self.is_written else before
-        return before, math.inf if after is None else after
+        return before, self._soc_error_pct(self.extended_model) if self.is_written else before
 
     def _keeps_soc(self, correction: Correction) -> bool:
         """Whether the SoC error of these logs grows by no more than its scatter.
@@ -171,17 +171,17 @@ class Diagnosis:
         A step of resistance within these logs is not tested: the corrected model has the step from
         the first row on, and is wrong before it.
         """
-        if correction.evidence.shape.place is not None:
+        if correction.is_of_log or correction.evidence.shape.place is not None:
             return True
         before = self._soc_error_pct(self._healthy_model)
-        if before is None:
-            return True
-        after = self._soc_error_pct(self._file(correction))
-        return after is not None and after <= before + WORSE_SOC_PCT
+        return not self._soc_error_pct(self._file(correction)) > before + WORSE_SOC_PCT
 
-    def _soc_error_pct(self, model: Model) -> float | None:
-        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None."""
-        errors: list[float] = []
+    def _soc_error_pct(self, model: Model) -> float:
+        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%].
+
+        NaN where none has one, infinite where the model gives no SoC.
+        """
+        errors: list[FloatArray] = []
         for log, rows in zip(self.logs, self.rows, strict=True):
             if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
                 continue
@@ -189,8 +189,11 @@ class Diagnosis:
             table = estimate(replace(rows.trace.log, soc_pct=None), model, initial_soc_pct="auto")
             own = np.interp(table.time_s, log.time_s[known], log.soc_pct[known])
             settled = table.time_s - table.time_s[0] >= SETTLING_S
-            errors += np.abs(table.soc_pct - own)[np.isfinite(table.soc_pct) & settled].tolist()
-        return float(np.mean(errors)) if errors else None
+            errors.append(np.abs(table.soc_pct - own)[np.isfinite(table.soc_pct) & settled])
+        if not errors:
+            return math.nan
+        together = np.concatenate(errors)
+        return float(together.mean()) if together.size else math.inf
 
     @property
     def errors(self) -> Errors:

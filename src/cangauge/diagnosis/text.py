@@ -29,9 +29,6 @@ FAULT: Final[Mapping[str, Mapping[str, Any]]] = tomllib.loads(
 )
 """Fault → its words; see `words.toml`."""
 
-SLOW_S, SHORT_S = 10.0, 600.0
-"""Interval of rows that no longer follow the load, the shortest memory of both equations; and the
-duration below which slow effects hardly develop [s]."""
 LEAST_REFERENCES: Final = 3
 """References from which on probabilities are reliable."""
 SHOWN_VISIBLE: Final = ("voltage_offset", "current_offset", "resistance_growth")
@@ -233,7 +230,7 @@ def caveats(found: Diagnosis) -> list[str]:
     """Return what limits the answer, a sentence each."""
     remarks = list(found.remarks)
     number_of = len(found.references)
-    if found.has_references and 0 < number_of < LEAST_REFERENCES:
+    if 0 < number_of < LEAST_REFERENCES:
         remarks.append(
             f"{counted(number_of, 'reference')} cannot show how much healthy logs differ: give"
             f" {LEAST_REFERENCES} or more."
@@ -241,26 +238,25 @@ def caveats(found: Diagnosis) -> list[str]:
     if not found.has_references:
         remarks.append("Without references the error that the model file states counts as normal.")
     for log, rows in zip(found.logs, found.rows, strict=True):
-        part = 1.0 - rows.kept.size / max(rows.trace.rows.size, 1)
+        name, steps_s = log.name, np.diff(log.time_s)
+        interval_s, part = float(np.median(steps_s)), 1.0 - rows.kept.size / rows.trace.rows.size
         if found.has_references and part > 0.05:
             remarks.append(
-                f"{percent(part)} of {log.name} lies at SoC that no reference visits (within"
+                f"{percent(part)} of {name} lies at SoC that no reference visits (within"
                 f" {COVER_PCT:.0f} %) and is left out."
             )
-        interval_s = float(np.median(np.diff(log.time_s)))
-        if interval_s >= SLOW_S:
+        if interval_s >= 10.0:  # the shortest memory of both equations
             remarks.append(
-                f"{log.name} has a row every {number(interval_s, 0, 's')}: what the current did"
+                f"{name} has a row every {number(interval_s, 0, 's')}: what the current did"
                 " between them is not known, and may look like a fault of clock, resistance or"
                 " current."
             )
-        if log.duration_s < SHORT_S:
+        if log.duration_s < 600.0:
             minutes = number(log.duration_s / 60.0, 0, "min")
-            remarks.append(f"{log.name} lasts {minutes}: slow effects hardly develop in it.")
-        if np.diff(log.time_s).max() > bridge_s(log.time_s):
-            remarks.append(f"{log.name} has gaps; charge that flowed in them is not counted.")
-    remarks.append("A fault is a signature at the terminals, not proof of a mechanism.")
-    return remarks
+            remarks.append(f"{name} lasts {minutes}: slow effects hardly develop in it.")
+        if steps_s.max() > bridge_s(log.time_s):
+            remarks.append(f"{name} has gaps; charge that flowed in them is not counted.")
+    return [*remarks, "A fault is a signature at the terminals, not proof of a mechanism."]
 
 
 def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:

@@ -65,11 +65,11 @@ class Errors:
         in_logs = [piece[self.log == k].max(initial=-1) + 1 for k in range(int(self.log[-1]) + 1)]
         return np.asarray(piece + np.cumsum([0, *in_logs])[self.log])
 
-    def drawn_sums(self, *values: FloatArray) -> list[FloatArray]:
-        """Return sums of values over pieces drawn with replacement, shape (draws,) each."""
-        sums = [np.bincount(self.piece, weights=each) for each in values]
-        draw = np.random.default_rng(0).integers(0, sums[0].size, (DRAWS, sums[0].size))
-        return [np.asarray(each[draw].sum(axis=1)) for each in sums]
+    def drawn(self, values: FloatArray) -> FloatArray:
+        """Return sums of values over pieces drawn with replacement, shape (draws,)."""
+        sums = np.bincount(self.piece, weights=values)
+        draw = np.random.default_rng(0).integers(0, sums.size, (DRAWS, sums.size))
+        return np.asarray(sums[draw].sum(axis=1))
 
 
 def rms(errors_v: FloatArray) -> float:
@@ -89,12 +89,11 @@ def closed_part(
     if not gap > 0.0:
         return None, None
     closed = min(float((before.mean() - after.mean()) / gap), 1.0)
-    drawn_before, drawn_after, rows = errors.drawn_sums(before, after, np.ones(before.size))
-    gaps = drawn_before - healthy_v2 * rows
+    gaps = errors.drawn(before) - healthy_v2 * errors.drawn(np.ones(before.size))
     usable = gaps > 0.0
     if usable.mean() < 0.9:
         return closed, None
-    parts = np.minimum((drawn_before - drawn_after)[usable] / gaps[usable], 1.0)
+    parts = np.minimum(errors.drawn(before - after)[usable] / gaps[usable], 1.0)
     low, high = np.quantile(parts, [0.025, 0.975])
     return closed, (float(low), float(high))
 
@@ -104,31 +103,28 @@ def excesses(errors: Errors, capacity_ah: float) -> list[dict[str, Any]]:
 
     `excess` is a ratio of RMS errors, `ci` its 95 % interval. None where there is no error at all.
     """
-    square, piece = errors.before_v**2, errors.piece
+    square, found = errors.before_v**2, []
     if not square.any():
         return []
-    found = []
+    whole, all_rows = errors.drawn(square), errors.drawn(np.ones(square.size))
     for axis, unit, values, edges in _axes(errors, capacity_ah):
         for low, high in itertools.pairwise(edges.tolist()):
             inside = (values >= low) & ((values < high) | (high >= edges[-1]))
-            if np.unique(piece[inside]).size < LEAST_PIECES:
+            if np.unique(errors.piece[inside]).size < LEAST_PIECES:
                 continue
-            part, rows, whole, all_rows = errors.drawn_sums(
-                square * inside, inside.astype(np.float64), square, np.ones(square.size)
-            )
+            part, rows = errors.drawn(square * inside), errors.drawn(inside.astype(np.float64))
             usable = (rows > 0.0) & (whole > 0.0)
             ratios = np.sqrt(part[usable] / rows[usable] * all_rows[usable] / whole[usable])
             here = rms(errors.before_v[inside])
-            found.append(
-                {
-                    "axis": axis,
-                    "range": [low, high],
-                    "unit": unit,
-                    "excess": here / rms(errors.before_v),
-                    "rmse_v": here,
-                    "ci": np.quantile(ratios, [0.025, 0.975]).tolist(),
-                }
-            )
+            entry = {
+                "axis": axis,
+                "range": [low, high],
+                "unit": unit,
+                "excess": here / rms(errors.before_v),
+                "rmse_v": here,
+                "ci": np.quantile(ratios, [0.025, 0.975]).tolist(),
+            }
+            found.append(entry)
     return found
 
 
