@@ -173,10 +173,7 @@ def rows(folder: Path) -> Iterator[tuple[str, ...]]:
                 capacity_ah=CAPACITY_AH,
             )
             before = [log.voltage_v - volts for log, volts in runs]
-            after = [
-                log.voltage_v - found.simulator.corrected_v(number, found.extended_model)
-                for number, (log, _) in enumerate(runs)
-            ]
+            after = [found.extended_model.predict(log).residual_v for log in found.logs]
             yield (
                 name,
                 fault.name,

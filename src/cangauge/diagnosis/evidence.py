@@ -56,7 +56,7 @@ class Evidence:
     shapes: tuple[Shape | None, ...]
     """Its shape in each log; None before a step of resistance."""
     nats: float
-    """n_k/o_k: gain of log likelihood over the excess that references show [nats]."""
+    """n_k: gain of log likelihood [nats]."""
     left_v2: float
     """V_k: mean square error that remains [V²]."""
     size: float
@@ -118,7 +118,7 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
     found = {}
     names = np.array([shape.effect.id for shape in tried])
     for name in dict.fromkeys(names.tolist()):
-        mine, o = np.flatnonzero(names == name), healthy.excess_of(name)
+        mine, o = np.flatnonzero(names == name), healthy.excess[name]
         top = int(mine[np.argmax(gain[mine])])
         bound, delta = tried[top].bound, solved[:, -1] - solved[:, top] * size[top]
         columns = list(zip(logs, at[top].tolist(), strict=True))
@@ -129,7 +129,7 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
                 None if k < 0 else healthy.tried[k].in_log(log.trace.log.duration_s)
                 for log, k in columns
             ),
-            nats=float(gain[top]) / o,
+            nats=float(gain[top]),
             left_v2=square_v2 / total_s(logs),
             size=float(size[top]) * bound,
             std=float(np.sqrt(o / (s[top] + RIDGE))) * bound,
@@ -211,7 +211,7 @@ def _calibrated(healthy: Healthy, left_out: Sequence[tuple[LogRows, Healthy]]) -
 
     `left_out` holds each reference, and the healthy pack without it.
     """
-    found = [analyse(replace(others, excess={"": 1.0}), [log]) for log, others in left_out]
+    found = [analyse(others, [log]) for log, others in left_out]
     chi2 = {name: np.array([one[name].chi2 for one in found]) for name in found[0]}
     usual = max(1.0, float(np.median([x.mean() for x in chi2.values()])))
     # The mean of few references may be far off: two more that show the usual χ² of all effects,

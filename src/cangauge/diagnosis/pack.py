@@ -22,7 +22,7 @@ other, `eliminated` integrates the first unknowns out, and `posterior` solves fo
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -40,6 +40,7 @@ from cangauge.diagnosis.linear import (
 from cangauge.diagnosis.rows import Simulated, Trace, covered, without_outliers
 from cangauge.diagnosis.shapes import Shape, shape_columns, shapes
 from cangauge.model.effects.base import Pack
+from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.gaussian import Rows
 from cangauge.model.model_file import Model
@@ -64,10 +65,6 @@ SOC_SCATTER, SOC_RESOLUTION_PCT, SOC_STANDS_OUT = 0.02, 0.7, 3.0
 """Usual scatter of counted charge over the change of a log's own SoC [-]; resolution of such a SoC
 [%], that of a start; and the standard deviations from which it is evidence: below, a gauge may
 count with the faulty sensor itself."""
-
-UNTESTED_EXCESS: Final = 22.0
-"""Excess of an effect's evidence where fewer than two references show it: nine of ten effects stay
-below it in development packs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +139,14 @@ def _healthy_shapes(tried: Sequence[Shape]) -> IntArray:
     return np.array([k for k, shape in enumerate(tried) if shape.is_of_pack][::2], dtype=np.intp)
 
 
+def _untested() -> dict[str, float]:
+    """Return the excess of every effect where fewer than two references show it.
+
+    Nine of ten effects stay below it in development packs.
+    """
+    return dict.fromkeys(LIBRARY, 22.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Healthy:
     """What the healthy pack does, and how much healthy logs differ."""
@@ -162,7 +167,7 @@ class Healthy:
     """Variance of the prediction of a left-out reference by the others, mean of all [V²]."""
     nats: tuple[float, ...] = ()
     """Most evidence of any effect in each left-out reference [nats]."""
-    excess: dict[str, float] = field(default_factory=dict)
+    excess: Mapping[str, float] = field(default_factory=_untested)
     """o_k of each effect."""
     soc_ratio: tuple[float, float] = (1.0, SOC_SCATTER)
     """Counted charge over the change of a log's own SoC: mean and scatter."""
@@ -176,10 +181,6 @@ class Healthy:
     def rmse_v(self) -> float:
         """RMS error of a healthy log [V]."""
         return float(np.sqrt(self.healthy_v2))
-
-    def excess_of(self, effect: str) -> float:
-        """Return o_k of an effect."""
-        return self.excess.get(effect, 1.0 if self.excess else UNTESTED_EXCESS)
 
     @property
     def n(self) -> int:

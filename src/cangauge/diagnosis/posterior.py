@@ -83,12 +83,12 @@ def features(
 ) -> Features:
     """Return what the posterior sees of a case."""
     v = healthy.healthy_v2 + max(healthy.open_v2(logs) - healthy.mean_open_v2, 0.0)
-    over = np.array([healthy.excess_of(name) for name in evidence])
+    over = np.array([healthy.excess[name] for name in evidence])
     nats = np.maximum([e.nats for e in evidence.values()], 0.0)
     left = np.array([e.left_v2 for e in evidence.values()]) / v
-    lacking = np.max(nats * over) / over - nats
-    each = np.column_stack([np.log1p(nats), -np.log1p(left), -np.log1p(lacking)])
-    best, most = int(np.argmax(each[:, 0] + each[:, 1])), float(np.log1p(nats.max()))
+    lacking = (nats.max() - nats) / over
+    each = np.column_stack([np.log1p(nats / over), -np.log1p(left), -np.log1p(lacking)])
+    best, most = int(np.argmax(each[:, 0] + each[:, 1])), float(each[:, 0].max())
     usual = np.mean(np.log1p(healthy.nats or UNTESTED))
     gap = healthy.gap_v2(logs) / v / (1.0 if healthy.nats else UNTESTED**2)
     outer = np.array([np.log(left[best] + 0.1), most, most - usual, np.log(gap), 1.0])

@@ -108,16 +108,8 @@ class SimulatorGap:
     references: tuple[Log, ...]
     model: Model
     """Identified on the simulator's output."""
-    simulated_v: tuple[FloatArray, ...]
-    """Of each diagnosed log [V]."""
     remark: str
     """Where the simulator is off everywhere; "" else."""
-
-    def corrected_v(self, number: int, extended: Model) -> FloatArray:
-        """Return the simulated voltage of a log with the correction of an extended model [V]."""
-        log = self.logs[number]
-        change_v = self.model.predict(log).residual_v - extended.predict(log).residual_v
-        return np.asarray(self.simulated_v[number] + change_v)
 
 
 def correction(evidence: Evidence) -> str:
@@ -150,7 +142,6 @@ def simulator_gap(
         logs=tuple(on_model[:number]),
         references=tuple(on_model[number:]),
         model=model,
-        simulated_v=tuple(volts[:number]),
         remark=_level_remark(every, volts, number),
     )
 

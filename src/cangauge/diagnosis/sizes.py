@@ -128,7 +128,7 @@ class SizeProfile:
         A size of zero has no evidence.
         """
         size, here = 0.0, self.about(evidence, 0.0)
-        without, over = here[0], self._healthy.excess_of(evidence.shape.effect.id)
+        without, over = here[0], self._healthy.excess[evidence.shape.effect.id]
         tried = {start: self.about(evidence, start) for start in starts if abs(start) >= MIN_STEP}
         step = min(tried, key=tried.__getitem__, default=0.0)
         for _ in range(STEPS):
@@ -148,7 +148,7 @@ class SizeProfile:
             evidence,
             size=size * bound,
             std=float(np.sqrt(over / (curvature + RIDGE))) * bound,
-            nats=0.5 * (without - chi2) / over,
+            nats=0.5 * (without - chi2),
             left_v2=left_v2,
         )
 
@@ -157,10 +157,10 @@ def sized_by_simulation(
     healthy: Healthy, logs: Sequence[LogRows], evidence: dict[str, Evidence]
 ) -> dict[str, Evidence]:
     """Return the evidence with effects on signals and count simulated at their sizes."""
-    nats = {name: e.nats * healthy.excess_of(name) for name, e in evidence.items()}
+    most = max(e.nats for e in evidence.values())
     profile, found = SizeProfile(healthy, logs, _every(logs)), dict(evidence)
     for name, e in evidence.items():
-        is_likely = nats[name] > SIMULATED_PART * max(nats.values())
+        is_likely = e.nats > SIMULATED_PART * most
         shape = e.shape
         if shape.effect.adds_voltage or not (is_likely or e.fault in MOVE_SOC):
             continue
