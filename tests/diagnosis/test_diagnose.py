@@ -445,6 +445,20 @@ def test_a_log_is_not_its_own_reference(references: list[Log], model: Model) -> 
         diagnose([references[0]], model, references)
 
 
+def test_the_shortest_log_is_diagnosed(known: Healthy, model: Model) -> None:
+    """Its rows fill one block of those that are held out."""
+    log = more_volts(day(20).rows(slice(0, 310)), 6.0)
+    found = diagnose([log], model, known)
+    assert np.isfinite(found.extended_rmse_v)
+    assert "lasts 5 min: slow effects hardly develop" in " ".join(found.caveats)
+
+
+def test_a_log_with_gaps_says_so(known: Healthy, model: Model) -> None:
+    log = day(20)
+    found = diagnose([log.rows((log.time_s < 600.0) | (log.time_s > 1500.0))], model, known)
+    assert "has gaps; charge that flowed in them is not counted" in " ".join(found.caveats)
+
+
 def test_a_single_wrong_row_is_no_fault(known: Healthy, model: Model) -> None:
     log = day(20)
     volts = log.voltage_v.copy()

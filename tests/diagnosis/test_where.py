@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.where import Errors, closed_part, excesses
+from cangauge.diagnosis.where import Errors, clause, closed_part, excesses
 
 
 def errors_v(rows: int, wrong: int) -> Errors:
@@ -38,3 +38,36 @@ def test_a_drawn_piece_without_rows_costs_the_closed_part_nothing() -> None:
     closed, _ = closed_part(apart, 0.1)
     assert closed is not None
     assert 0.7 < closed < 1.0
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ("low SoC", "below 25 % SoC"),
+        ("cold", "below 15 °C"),
+        ("charging", "while charging at 1 to 20 A"),
+        ("after a rest", "in the first 10 min after a rest"),
+        ("nowhere", "everywhere alike"),
+    ],
+)
+def test_where_the_error_is_larger_is_said_in_words(where: str, words: str) -> None:
+    """Eight times an hour of driving and 15 min of rest, over all SoC."""
+    time_s = np.arange(0.0, 8 * 4500.0)
+    in_turn = time_s % 4500.0
+    driving = in_turn < 3600.0
+    rng = np.random.default_rng(1)
+    charging = rng.uniform(size=8 * 15).repeat(300) < 0.3
+    current_a = np.where(driving, np.where(charging, -20.0, 40.0), 0.0)
+    soc_pct = 58.0 + 38.0 * np.cos(time_s / 2900.0)
+    celsius = np.where(rng.uniform(size=8 * 15).repeat(300) < 0.3, 12.0, 22.0)
+    wrong = {
+        "low SoC": soc_pct < 25.0,
+        "cold": celsius < 15.0,
+        "charging": current_a < 0.0,
+        "after a rest": (in_turn < 600.0) & (time_s > 4500.0),
+        "nowhere": np.zeros(time_s.size, dtype=bool),
+    }[where]
+    before_v = np.where(wrong, 4.0, 1.0) * rng.normal(size=time_s.size)
+    log = np.zeros(time_s.size, dtype=np.intp)
+    errors = Errors(log, time_s, current_a, celsius, soc_pct, before_v, before_v)
+    assert clause(excesses(errors, 60.0)).startswith(words)

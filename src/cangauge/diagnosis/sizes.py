@@ -26,7 +26,7 @@ MOVE_SOC: Final = ("start", "capacity", "current_reading")
 
 FOLDS, BLOCK_S = 4, 240.0
 """Interleaved blocks of a log that are held out in turn, and their length [s]: longer than the
-correlation of the errors."""
+correlation of the errors; less in a short log, which has one block of each."""
 
 
 class SizeProfile:
@@ -188,6 +188,7 @@ def folds(healthy: Healthy, logs: Sequence[LogRows]) -> list[tuple[SizeProfile, 
     else:
         (log,) = logs
         time_s = log.trace.log.time_s[log.trace.rows][log.kept]
-        fold = ((time_s - time_s[0]) // BLOCK_S).astype(np.intp) % FOLDS
+        block_s = min(BLOCK_S, (time_s[-1] - time_s[0]) / FOLDS + 1.0)
+        fold = ((time_s - time_s[0]) // block_s).astype(np.intp) % FOLDS
         judged = [[fold == k] for k in range(FOLDS)]
     return [(SizeProfile(healthy, logs, [~rows for rows in part]), part) for part in judged]
