@@ -11,6 +11,7 @@ import pytest
 
 from cangauge._resources import shared_file
 from cangauge.errors import InputError
+from cangauge.estimation.offline import estimate
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -38,6 +39,14 @@ def test_round_trip(model: Model, tmp_path: Path) -> None:
         again.voltage_model().voltage(soc, [5.0, 20.0, 30.0], currents),
         model.voltage_model().voltage(soc, [5.0, 20.0, 30.0], currents),
     )
+
+
+def test_models_that_have_estimated_are_compared_by_their_fields(model: Model, log: Log) -> None:
+    again = Model.model_validate_json(model.to_json())
+    for each in (model, again):
+        estimate(log.rows(slice(0, 100)), each)
+    assert again == model
+    assert again.model_copy(update={"capacity_ah": 50.0}) != model
 
 
 def test_information_holds_the_coefficients(model: Model) -> None:

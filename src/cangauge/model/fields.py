@@ -30,10 +30,14 @@ Delays = Annotated[tuple[Delay, ...], Field(min_length=1), AfterValidator(increa
 Knots = Annotated[tuple[Soc, ...], Field(min_length=2), AfterValidator(increasing)]
 
 
-class Fields(BaseModel):
+class Fields(BaseModel):  # noqa: PLW1641 (frozen: pydantic gives its hash)
     """Part of a model file: no further fields, no change, no infinite number."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether all fields are equal; arrays that are cached beside them do not count."""
+        return isinstance(other, type(self)) and self.model_dump() == other.model_dump()
 
 
 def check_shape(field: str, values: Sequence[Any], number: int, *inner: int) -> None:
