@@ -156,6 +156,18 @@ def test_of_two_levels_none_is_taken_for_right(
     assert ("when it set itself" in judgement.text) == (before != 0.0)
 
 
+def test_the_level_that_holds_now_is_one_fault(pack: Pack) -> None:
+    model, logs = pack
+    changed = shifted(logs, -6.0, -6.0, -6.0, -14.0, -14.0)
+    late = np.arange(len(logs[2])) > 0.6 * len(logs[2])
+    changed[2] = replace(logs[2], soc_pct=logs[2].soc_pct - np.where(late, 14.0, 6.0))
+    faults = cangauge.judge(changed, model).faults
+    assert {fault.name for fault in faults} == {"start_or_reset"}
+    now = min(faults, key=lambda fault: fault.size)
+    assert now.size == pytest.approx(-14.0, abs=3.0 * now.std)
+    assert now.std < 2.0
+
+
 def test_a_gauge_that_was_set_between_two_logs_is_right_after(pack: Pack) -> None:
     model, logs = pack
     judgement = cangauge.judge(shifted(logs, -12.0, -12.0, 0.0, 0.0, 0.0), model)

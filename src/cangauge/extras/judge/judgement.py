@@ -267,11 +267,18 @@ def _stand(pieces: Sequence[Piece]) -> list[FoundFault]:
 def _faults(chain: Chain, fits: Sequence[Fitted]) -> list[FoundFault]:
     """Return the faults that are probable, of a known sign and a possible size, and matter."""
     shapes = defaultdict[tuple[str, int, int], list[tuple[float, float, float, Column]]](list)
+    now = np.flatnonzero(chain.piece >= 0)[-1:]
     for fit in fits:
-        stds = np.linalg.norm(fit.posterior.root, axis=1)
-        for column, size, std in zip(fit.faults, fit.posterior.mean, stds, strict=False):
+        # Levels that hold now are one, whatever was before.
+        together = defaultdict[tuple[str, int, int], list[int]](list)
+        for k, column in enumerate(fit.faults):
             if fit.is_counter or not FAULTS[column.fault].is_of_count:
-                shapes[column.name].append((fit.share, size, std, column))
+                is_now = column.piece >= 0 and np.any(np.asarray(column.shown)[now])
+                together[(column.fault, -1, 0) if is_now else column.name].append(k)
+        for name, ks in together.items():
+            size = float(fit.posterior.mean[ks].sum())
+            std = float(np.linalg.norm(fit.posterior.root[ks].sum(axis=0)))
+            shapes[name].append((fit.share, size, std, fit.faults[ks[0]]))
     found = []
     for of_name in shapes.values():
         share, sizes, stds = np.array([numbers for *numbers, _ in of_name]).T

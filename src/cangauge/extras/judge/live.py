@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 WITHIN_S: Final = 900.0
 """Longest judgement [s]: fifteen days of driving take a minute on a small computer."""
-CLOSE_WITHIN_S: Final = 2.0
 RESULT: Final = "judgement.json"
 PAGE: Final = "judgement.html"
 _NUMBER: Final = re.compile(r"\d+")
@@ -132,7 +131,7 @@ class LiveJudge(Output):
     def close(self) -> None:
         """Write what is kept; it is judged at the next start, and the last result stays."""
         self._end_stretch(is_judged=False)
-        if not self._worker.close(CLOSE_WITHIN_S):
+        if not self._worker.close(2.0):
             _failed(
                 TimeoutError("a judgement was not over at the end; its last logs may be missing")
             )

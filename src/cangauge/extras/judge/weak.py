@@ -28,8 +28,6 @@ from cangauge.model.voltage_model import hermite_basis
 
 LEAST_STD_PCT: Final = 1.0
 """Least spread of the capacities of healthy cells [%]: sorted cells of one batch."""
-LEAST_SPAN_PCT: Final = 10.0
-"""Least span of SoC over all logs from which capacities are compared [%]."""
 
 
 def weakest_cell(
@@ -63,7 +61,8 @@ def weakest_cell(
     cells, S, current_a = map(np.concatenate, (volts, socs, amps))
     has = np.isfinite(cells).all(axis=1)
     cells, S, current_a = cells[has], S[has], current_a[has]
-    if S.size < 4 or cells.shape[1] < 3 or np.ptp(S) < LEAST_SPAN_PCT:
+    # Over less of the SoC a balance looks like a capacity.
+    if S.size < 4 or cells.shape[1] < 3 or np.ptp(S) < 10.0:
         return None
     lack = _lacks_pct(chain, cells, S, current_a)
     spread = max(LEAST_STD_PCT, float(median_abs_deviation(lack, scale="normal")))
