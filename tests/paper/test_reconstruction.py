@@ -34,7 +34,7 @@ def rows_of(variant: str) -> FitRows:
 
 
 def error_of(rows: FitRows) -> np.ndarray:
-    truth = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.currents_a)
+    truth = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.current_columns_a)
     return np.asarray(rows.voltage_v - truth)
 
 

@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike
 
 from cangauge._typing import FloatArray
 from cangauge.estimation.counting import UNKNOWN_STD_PCT
-from cangauge.estimation.health import SeparateBias
+from cangauge.estimation.health import FriedlandBias
 from cangauge.estimation.state import Block
 from cangauge.model.extended import OnlineModel
 
@@ -74,8 +74,7 @@ CLOSE_PCT: Final = 0.05
 """Iterations, and the change of the SoC that ends them [%]: less than any σ of the filter. Newton's
 method doubles its digits with each, so that eight are needed only where the curve has a kink."""
 
-LOWEST_PCT: Final = -25.0
-HIGHEST_PCT: Final = 125.0
+BOUNDS_PCT: Final = (-25.0, 125.0)
 """Bounds of the SoC in the filter [%]: as far as a capacity leads that is stated 20 % too small,
 two standard deviations of its prior. A bound that holds the state back falsifies the capacity that
 is learned: with −5 % a capacity stated 10 % too small was learned 6 % too small."""
@@ -110,7 +109,7 @@ class SocFilter:
         Latest innovation and its variance.
     evidence : float
         Sum of the log-likelihoods of all voltages, which compares starts.
-    bias : SeparateBias
+    bias : FriedlandBias
         Capacity and resistance, learned beside the state by Friedland's filter.
     """
 
@@ -127,7 +126,7 @@ class SocFilter:
         self.P[SOC, SOC] = soc_std_pct**2
         self.y, self.S = 0.0, 1.0
         self.evidence = 0.0
-        self.bias = SeparateBias(n)
+        self.bias = FriedlandBias(n)
 
     @cached_property
     def _kalman(self) -> Any:
@@ -172,6 +171,7 @@ class SocFilter:
     def update(self, block: Block) -> None:
         """Correct the state by the mean voltage of a block."""
         prior, x = self.x, self.x
+        low_pct, high_pct = BOUNDS_PCT
         iterations = ITERATIONS_AT_MOST if self.P[SOC, SOC] > LINEAR_PCT**2 else 1
         damping, last_step_pct = 1.0, 0.0
         for _ in range(iterations):
@@ -181,7 +181,7 @@ class SocFilter:
             K = PHt / self.S
             self.y = block.voltage_v - voltage_v - float(H @ (prior - x))
             target = prior + K * self.y
-            target[SOC] = min(max(target[SOC], LOWEST_PCT), HIGHEST_PCT)
+            target[SOC] = min(max(target[SOC], low_pct), high_pct)
             step_pct = float(target[SOC] - x[SOC])
             if step_pct * last_step_pct < -0.5 * last_step_pct**2:
                 damping *= 0.5  # Full Newton steps oscillate across a kink.

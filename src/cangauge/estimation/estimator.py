@@ -265,20 +265,11 @@ class Estimator:
         self._memory.coulomb_var_pct2 += WRONG_PRIOR * moved_pct**2
 
     def _use_row(self, sample: Sample) -> None:
-        """Compare a row's voltage with the model, and add it to the open block."""
+        """Compare a row's voltage with the model, add it to the open block, look for references."""
         memory, online, counter = self._memory, self.online, self._counter
         load, load_v, drop_v = self._load()
-        guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
-        memory.newton_pct = memory.newton_std_pct = math.nan
-        memory.newton_inside = True
+        self._invert(sample.voltage_v - load_v, load)
         if not math.isnan(sample.voltage_v):
-            ocv_v = sample.voltage_v - load_v
-            newton = soc_from_ocv(online.pseudo_ocv_at, ocv_v, guess_pct)
-            memory.newton_pct, memory.newton_inside = newton
-            if self.settings.method == "newton":  # no other method asks for it
-                memory.newton_std_pct = inverse_std_pct(
-                    online, memory.newton_pct, self._temperature_c, load
-                )
             row = Block(
                 counter.counted_s,
                 counter.discharged_pct,
@@ -292,13 +283,24 @@ class Estimator:
             self._block.add(row)
             self._confirm_current(row, sample)
             checks.watch_sign(memory, sample, self.capacity_ah)
-        soc_pct = self._soc()[0]
-        memory.voltage_model_v = math.nan
-        if not math.isnan(soc_pct):
-            memory.voltage_model_v = online.pseudo_ocv_at(soc_pct)[0] + load_v
+        memory.voltage_model_v = online.pseudo_ocv_at(self._soc()[0])[0] + load_v
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in checks.detect_references(self.settings, memory, sample):
             self._correct(*reference)
+
+    def _invert(self, ocv_v: float, load: FloatArray) -> None:
+        """Find the SoC of a row's voltage without load [V]; NaN: it has none."""
+        memory, at = self._memory, self.online.pseudo_ocv_at
+        guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
+        memory.newton_pct = memory.newton_std_pct = math.nan
+        memory.newton_inside = True
+        if math.isnan(ocv_v):
+            return
+        memory.newton_pct, memory.newton_inside = soc_from_ocv(at, ocv_v, guess_pct)
+        if self.settings.method == "newton":  # no other method asks for it
+            memory.newton_std_pct = inverse_std_pct(
+                self.online, memory.newton_pct, self._temperature_c, load
+            )
 
     def _confirm_current(self, row: Block, sample: Sample) -> None:
         """Compare a current beyond the fit's with the voltage: a false one has no voltage drop.
@@ -331,12 +333,15 @@ class Estimator:
         elif hypotheses.is_rejected and not was_rejected:
             memory.contradicted_until_s = time_s + CONTRADICTED_S
         memory.is_known = True
-        self._test(time_s)
+        if self._is_mismatched(time_s):
+            # The model may be right and the SoC wrong: charge that was not seen.
+            memory.innovations = []
+            self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
         if math.isnan(memory.coulomb_start_pct):
             self._start_count(*self._filter_soc())
 
-    def _test(self, time_s: float) -> None:
-        """Test the innovations of the last ten minutes, and what the filter has learned.
+    def _is_mismatched(self, time_s: float) -> bool:
+        """Flag a mismatch, and return whether the innovations of the last ten minutes show it.
 
         Under the model the normalised innovations are independent standard normal, and what is
         learned of the constants lies together within their priors.
@@ -348,10 +353,7 @@ class Estimator:
         is_lasting = sum(memory.innovations) > limits.innovations_at_most
         if is_lasting or likelier.strain() > limits.strain_at_most:
             memory.mismatch_until_s = time_s + checks.MISMATCH_S
-        if is_lasting:
-            # The model may be right and the SoC wrong: charge that was not seen.
-            memory.innovations = []
-            self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
+        return is_lasting
 
     def _predict(self, to: CoulombCounter) -> None:
         """Predict the filter to a count."""

@@ -40,22 +40,17 @@ RESISTANCE_STD: Final = 0.3
 """Prior relative standard deviation of the resistance: it doubles over a life and with cold, and
 the model may come from another season."""
 
-CAPACITY_WALK: Final = 1e-3
-RESISTANCE_WALK: Final = 0.02
-"""Random walks of both, relative, in a day: cells lose 2 % of capacity in a year; the temperature
-inside a pack differs from the measured one by another amount each day."""
-
-DAY_S: Final = 86400.0
-
 G, R = range(2)
 """Index of capacity and resistance."""
 
 PRIOR: Final = np.diag([CAPACITY_STD**2, RESISTANCE_STD**2])
-WALK_PER_S: Final = np.diag([CAPACITY_WALK**2, RESISTANCE_WALK**2]) / DAY_S
+WALK_PER_S: Final = np.diag([1e-3**2, 0.02**2]) / 86400.0
+"""Random walk of both, relative, of 0.1 % and 2 % in a day [1/s]: cells lose 2 % of capacity in a
+year; the temperature inside a pack differs from the measured one by another amount each day."""
 
 
-class SeparateBias:
-    """Capacity and resistance of one filter.
+class FriedlandBias:
+    """Capacity and resistance of one filter: the second stage of Friedland's two-stage filter.
 
     Parameters
     ----------
@@ -108,7 +103,7 @@ class SeparateBias:
         """Both in standard deviations of their prior, shape (2,)."""
         return np.asarray(self.b / np.sqrt(np.diag(PRIOR)))
 
-    def take_over(self, before: SeparateBias, ratio: float) -> None:
+    def take_over(self, before: FriedlandBias, ratio: float) -> None:
         """Keep the capacity learned with another reference capacity, `ratio` times as large."""
         self.b[G] = (1.0 + before.b[G]) * ratio - 1.0
         self.P[G, G] = before.P[G, G] * ratio**2

@@ -36,13 +36,6 @@ of the model being 10 s apart."""
 ENERGY_C_RATE: Final = 1.0 / 3.0
 """Discharge for the energy [1/h] (IEC 62660-1)."""
 
-ENERGY_STEPS: Final = 40
-"""Steps of the discharge for the energy: 2.5 % from full, half of the distance of two knots."""
-
-ITERATIONS: Final = 6
-CLOSE_A: Final = 1e-3
-"""Steps of Newton's method, and the change of the current that ends them [A]."""
-
 UNKNOWN: Final = (math.nan, math.nan)
 
 
@@ -115,7 +108,7 @@ class PowerModel:
         """Return the energy left, its standard deviation [Wh] and the SoC at which it ends [%]."""
         capacity_ah = ahead.health.capacity_ah
         to_pct = min(self.cutoff_pct, ahead.soc_pct)
-        soc_pct = np.linspace(ahead.soc_pct, to_pct, ENERGY_STEPS + 1)
+        soc_pct = np.linspace(ahead.soc_pct, to_pct, 41)  # half a distance of two knots
         volts = ahead.lasting_v(soc_pct, ENERGY_C_RATE * capacity_ah)
         first_v, unknown_pct = float(volts[0]), 0.0
         if np.any(volts <= self.min_v):
@@ -214,12 +207,12 @@ class _Ahead:
         fixed_v = self._fixed_v + learned_v + float(base @ self._theta) - limit_v
         ohm = float(per_a @ self._theta)
         current_a = volt_per_a = 0.0
-        for _ in range(ITERATIONS):
+        for _ in range(6):  # Newton's method
             volts, slope = model.pseudo_ocv_at(self.soc_pct - pct_per_a * current_a)
             volt_per_a = slope * pct_per_a - ohm
             step_a = (volts + fixed_v + ohm * current_a) / volt_per_a
             current_a += step_a
-            if abs(step_a) < CLOSE_A:
+            if abs(step_a) < 1e-3:
                 break
         if volt_per_a <= 0.0:
             return None

@@ -102,6 +102,11 @@ class Hypotheses:
         return self.prior_log_odds + gained
 
     @property
+    def wide_probability(self) -> float:
+        """Probability of the wide hypothesis."""
+        return 1.0 / (1.0 + math.exp(-self.log_odds))
+
+    @property
     def is_rejected(self) -> bool:
         """Whether the narrow hypothesis is the less likely one."""
         return self.log_odds > 0.0 if len(self.filters) == 2 else self.decision > 0
@@ -150,8 +155,8 @@ class Hypotheses:
             Standard deviation of the SoC if it has not [%].
         """
         if len(self.filters) == 2 and abs(self.log_odds) < CLEAR_LOG_ODDS:
-            before = 1.0 / (1.0 + math.exp(-self.log_odds))
-            self.prior_log_odds = _log_odds(1.0 - (1.0 - before) * (1.0 - probability))
+            neither = (1.0 - self.wide_probability) * (1.0 - probability)
+            self.prior_log_odds = _log_odds(1.0 - neither)
             self.filters[1].evidence = self.filters[0].evidence  # it is in the prior now
         else:
             self.filters = [self.likelier, self.likelier.copy()]
@@ -165,14 +170,12 @@ class Hypotheses:
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
     ) -> tuple[float, float]:
         """Return the predicted SoC and its standard deviation [%], both hypotheses weighed."""
-        soc_pct, variance = self.filters[0].soc_moments_after(
-            seconds, discharged_pct, variance_pct2
-        )
-        if len(self.filters) == 2:
-            wide_pct, wide_var = self.filters[1].soc_moments_after(
-                seconds, discharged_pct, variance_pct2
-            )
-            p = 1.0 / (1.0 + math.exp(-self.log_odds))
+        moments = [
+            each.soc_moments_after(seconds, discharged_pct, variance_pct2) for each in self.filters
+        ]
+        (soc_pct, variance), (wide_pct, wide_var) = moments[0], moments[-1]
+        if len(moments) == 2:
+            p = self.wide_probability
             mean_pct = (1.0 - p) * soc_pct + p * wide_pct
             variance = (1.0 - p) * (variance + (soc_pct - mean_pct) ** 2) + p * (
                 wide_var + (wide_pct - mean_pct) ** 2

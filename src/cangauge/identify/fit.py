@@ -337,16 +337,16 @@ class _Joint(NamedTuple):
     effects: tuple[tuple[Effect, Values], ...] = ()
 
     def held_out_v(self) -> tuple[FloatArray, ...]:
-        """Return the error of each log by the solution without it [V]; see `_held_out`."""
+        """Return the error of each log by the solution without it [V]; see `_comparable`."""
         errors_v = []
         for number, other in enumerate(self.without):
             coefficients, rows = other.select.T @ other.coefficients, self.rows[number]
             if self.tables:
                 error_v = self.voltage_v[number] - self.tables[number] @ coefficients
             else:
-                error_v = rows.voltage_v - rows.linear(row_features, coefficients)
+                error_v = rows.voltage_v - rows.product(row_features, coefficients)
             errors_v.append(error_v)
-        return _held_out(self.rows, errors_v)
+        return _comparable(self.rows, errors_v)
 
 
 def _fit_knots(
@@ -459,8 +459,8 @@ def _fit_published(
     for number, item in enumerate(rows if len(rows) >= LOGS_AT_LEAST else ()):
         others = [place for place in range(len(rows)) if place != number]
         without = equation.fit([rows[k] for k in others], [roots[k] for k in others])
-        errors_v.append(item.voltage_v - item.linear(equation.columns, without.coefficients))
-    errors = _held_out(rows, errors_v)
+        errors_v.append(item.voltage_v - item.product(equation.columns, without.coefficients))
+    errors = _comparable(rows, errors_v)
     mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
     judged = _stated_error(errors, rows, published.residual_v, mean_v)
     jacobian, found = published.jacobian(), published.fields()
@@ -477,8 +477,8 @@ def _fit_published(
     return model, published, errors, None
 
 
-def _held_out(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-    """Return errors of left-out logs [V], NaN at SoC outside the range of the other logs.
+def _comparable(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+    """Return the errors of left-out logs [V], NaN at a SoC that no other log reaches.
 
     Parameters
     ----------

@@ -39,8 +39,6 @@ from cangauge.model.inverse import socs_from_ocv
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import VoltageModel
 
-JOULE_PER_KWH = 3.6e6
-
 NEAR_AN_END_PCT: Final = 10.0
 """Rest of the SoC beyond the logs that is not worth another drive [%]."""
 
@@ -83,13 +81,13 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
             driven += _integral(np.maximum(power_w, 0.0), step_s)
             regenerated += _integral(np.maximum(-power_w, 0.0), step_s)
             square += _integral(current_a**2, step_s)
-    net = driven - regenerated
-    heat = slope_ohm * square
+    net, heat = driven - regenerated, slope_ohm * square
+    joule_per_kwh = 3.6e6
     return Energy(
-        driven_kwh=driven / JOULE_PER_KWH,
-        regenerated_kwh=regenerated / JOULE_PER_KWH,
-        net_kwh=net / JOULE_PER_KWH,
-        heat_kwh=heat / JOULE_PER_KWH,
+        driven_kwh=driven / joule_per_kwh,
+        regenerated_kwh=regenerated / joule_per_kwh,
+        net_kwh=net / joule_per_kwh,
+        heat_kwh=heat / joule_per_kwh,
         efficiency_pct=100.0 * net / (net + heat) if net > 0.0 else float("nan"),
     )
 
@@ -145,7 +143,7 @@ def evaluate(model: ExtendedModel, rows: FitRows) -> LogFit:
 def _predicted(model: VoltageModel, rows: FitRows) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return pseudo-OCV and voltage [V], and the Newton inverse [%], without effects."""
     currents = len(model.loads.resistance_ohm)  # the published equation has delayed ones only
-    columns = model.load_columns(rows.temperature_c, rows.currents_a[:, :currents])
+    columns = model.load_columns(rows.temperature_c, rows.current_columns_a[:, :currents])
     load_v = columns @ model.load_coefficients
     voltage_v = model.pseudo_ocv(rows.soc_pct) + load_v
     newton_pct = socs_from_ocv(model, rows.voltage_v - load_v)
@@ -172,7 +170,7 @@ def slope_resistances(
         for part in item.rows.parts():
             block = item.rows.part(part)
             drop_v = block.voltage_v - item.pseudo_ocv_v[part]
-            table = np.column_stack([block.currents_a[:, : len(resistance_ohm)], drop_v])
+            table = np.column_stack([block.current_columns_a[:, : len(resistance_ohm)], drop_v])
             total = total + table.sum(axis=0)
             product = product + table[:, 0] @ table
     rows = sum(len(item.rows) for item in fits)

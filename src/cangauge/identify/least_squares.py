@@ -54,9 +54,6 @@ LOGS_AT_LEAST: Final = 3
 """Logs from which on they are left out in turn."""
 FOLDS_AT_MOST: Final = 40
 """Groups of logs that are left out; with more logs several are left out together."""
-ITERATIONS: Final = 12
-CONVERGED: Final = 1e-3
-"""Steps of the noise variance at most, and its relative change that ends them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +126,7 @@ def features(soc_pct: FloatArray, temperature_c: FloatArray, currents_a: FloatAr
 
 def row_features(rows: FitRows) -> FloatArray:
     """Return `features` of the rows of a fit, shape (m, BASE)."""
-    return features(rows.soc_pct, rows.dequantized_c, rows.currents_a)
+    return features(rows.soc_pct, rows.dequantized_c, rows.current_columns_a)
 
 
 def log_sums(
@@ -266,7 +263,7 @@ def solve(
         r_log = moments[:, -2, -1] - a @ theta0
         square = float(total[-1, -1] - theta0 @ (XWu + r))  # of the errors at θ₀
         variance = prior.residual_v**2
-        for _ in range(ITERATIONS):
+        for _ in range(12):  # fewer where it has converged
             v = variance * SECONDS_PER_DATUM
             s = 1.0 / (w + v / level_std**2)
             precision = (A - (a * s[:, None]).T @ a) / v + Lambda
@@ -277,7 +274,7 @@ def solve(
             square_left += float(level @ (w * level - 2.0 * left))
             residual2 = max(square_left, 0.0) / weight
             following = residual2 + (ADDED_STD * mean_v) ** 2
-            if abs(following / variance - 1.0) < CONVERGED:
+            if abs(following / variance - 1.0) < 1e-3:
                 break
             variance = following
         theta = theta0 + delta

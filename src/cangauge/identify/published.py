@@ -55,7 +55,7 @@ class PublishedEquation:
     def columns(self, rows: FitRows) -> FloatArray:
         """Return the columns of k0 … k7, kt, R1 … Rn, shape (m, p)."""
         warmer = rows.dequantized_c - self.t_ref_c
-        currents_a = rows.currents_a[:, : len(self.delay_s)]
+        currents_a = rows.current_columns_a[:, : len(self.delay_s)]
         return np.column_stack([ocv_basis(rows.soc_pct, self.epsilon), warmer, currents_a])
 
     def root(self, rows: FitRows) -> FloatArray:

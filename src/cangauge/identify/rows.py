@@ -126,7 +126,7 @@ class FitRows:
         return self.log.temperature_c[self.at]
 
     @property
-    def currents_a(self) -> FloatArray:
+    def current_columns_a(self) -> FloatArray:
         """I(t − dj), then the low-passed currents; positive = discharge [A], shape (m, M)."""
         log = self.log
         delayed = delayed_currents(log.time_s, log.current_a, self.delay_s, self.time_s)
@@ -146,10 +146,10 @@ class FitRows:
             low_passed_a=self.low_passed_a[rows],
         )
 
-    def linear(
+    def product(
         self, columns: Callable[[FitRows], FloatArray], coefficients: FloatArray
     ) -> FloatArray:
-        """Return columns of the rows times coefficients, shape (m,), in blocks."""
+        """Return the voltage by columns of the rows and their coefficients, shape (m,)."""
         return np.concatenate([columns(self.part(rows)) @ coefficients for rows in self.parts()])
 
 
@@ -172,7 +172,7 @@ def fit_rows(
     rate_hz : float
         Rate to which the log is decimated [Hz].
     delay_s, low_pass_s : sequence of float
-        Delays and time constants of `currents_a` [s].
+        Delays and time constants of `current_columns_a` [s].
 
     Raises
     ------

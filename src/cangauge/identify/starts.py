@@ -187,7 +187,9 @@ class _Unknown:
         """Return the start at which a solution misfits the voltage least [%]."""
         rows, chemistry = self.rows, pack.chemistry
         curve = HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N])
-        loads = load_features(rows.dequantized_c, rows.currents_a) @ solution.select[N:, N:].T
+        loads = (
+            load_features(rows.dequantized_c, rows.current_columns_a) @ solution.select[N:, N:].T
+        )
         open_v = rows.voltage_v - loads @ solution.coefficients[N:]
         level2 = float(chemistry.level_v(solution.mean_v)) ** 2
 

@@ -11,19 +11,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
 from cangauge.logs.gaps import BRIDGE_S, discharged_ah
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import (
     Counting,
     Effect,
     Load,
+    Memories,
     Pack,
     Signals,
     Values,
@@ -36,15 +35,9 @@ from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
 from cangauge.settings import GAP_S
 from cangauge.types import Sample
 
-LAG_NUMBERS = 3
-"""Numbers of the state of a lag that has started."""
-
 UNKNOWN_STD_K = 8.0
 """Standard deviation of an unknown temperature about the mean of the model's logs [K]: that of the
 days of a year in a temperate climate."""
-
-SLOPE_STEP_PCT = 0.05
-"""Half step of the finite difference of the effects' voltage over SoC [%]."""
 
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
 
@@ -187,10 +180,6 @@ class ExtendedModel:
         return counting
 
 
-BISECTIONS = 45
-"""Halvings of 0–100 % down to 3e-12 %."""
-
-
 def newton_soc(model: ExtendedModel, prediction: Prediction) -> FloatArray:
     """Return the SoC at which the model has the measured voltage at each row [%], shape (m,).
 
@@ -201,7 +190,7 @@ def newton_soc(model: ExtendedModel, prediction: Prediction) -> FloatArray:
     if not prediction.over_soc:
         return socs_from_ocv(model.model, measured - prediction.beside_v)
     low, high = np.zeros_like(measured), np.full_like(measured, 100.0)
-    for _ in range(BISECTIONS):
+    for _ in range(45):  # down to 3e-12 %
         middle = 0.5 * (low + high)
         above = model.voltage_at(middle, prediction) > measured
         low, high = np.where(above, low, middle), np.where(above, middle, high)
@@ -344,12 +333,13 @@ class OnlineModel:
         drives = self.drives if drives is None else drives
         volts += float(drives[0])
         if self._over_soc:
-            at = soc_pct + SLOPE_STEP_PCT * np.array([-1.0, 0.0, 1.0])
+            step_pct = 0.05  # of a central difference
+            at = soc_pct + step_pct * np.array([-1.0, 0.0, 1.0])
             extra = np.zeros(3)
             for (effect, values), drive in zip(self._over_soc, drives[1:], strict=True):
                 extra += drive * effect.over_soc(at, values, self.model)
             volts += float(extra[1])
-            slope += float(extra[2] - extra[0]) / (2.0 * SLOPE_STEP_PCT)
+            slope += float(extra[2] - extra[0]) / (2.0 * step_pct)
             slope = max(slope, self._slope_at_least)
         return volts, slope
 
@@ -384,31 +374,22 @@ class OnlineModel:
         for lag, value in zip(self.lags, low_passed_a, strict=True):
             lag.restore([0.0, 0.0, value])
 
-    def state(self) -> list[list[float]]:
-        """Return the low-passed currents' state, then that of each effect, for `restore`."""
-        lags = [number for lag in self.lags for number in lag.state()]
-        return [lags, *([x for item in at.memory for x in item.state()] for at in self._contexts)]
+    def state(self) -> list[list[list[float]]]:
+        """Return the state of the low-passed currents, then of each effect, for `restore`."""
+        return [[each.state() for each in memory] for memory in self._memories]
 
-    def restore(self, state: Sequence[Sequence[float]]) -> None:
+    def restore(self, state: Sequence[Sequence[Sequence[float]]]) -> None:
         """Continue from a saved state of the same model; the delay line is filled separately.
 
         Raises
         ------
-        InputError
-            If the state does not belong to this model, or is damaged. Names the effect.
+        ValueError
+            If the state does not belong to this model, or is damaged.
         """
-        if len(state) != 1 + len(self._contexts):
-            raise InputError(f"the model has {len(self._contexts)} effects", field="effects")
-        effects = (f"effects.{number}" for number in range(len(self._contexts)))
-        memories = [self.lags, *(at.memory for at in self._contexts)]
-        for part, memory, saved in zip(["low_pass", *effects], memories, state, strict=True):
-            size = LAG_NUMBERS if len(memory) > 1 else len(saved)  # several are lags
-            numbers = iter(saved)
-            try:
-                for item in memory:
-                    item.restore(list(islice(numbers, size)))
-                is_whole = next(numbers, None) is None
-            except (ValueError, TypeError):
-                is_whole = False
-            if not is_whole:
-                raise InputError("the saved state is damaged, or of another model", field=part)
+        for memory, saved in zip(self._memories, state, strict=True):
+            for each, numbers in zip(memory, saved, strict=True):
+                each.restore(numbers)
+
+    @property
+    def _memories(self) -> list[Memories]:
+        return [self.lags, *(context.memory for context in self._contexts)]

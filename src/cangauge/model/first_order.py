@@ -18,12 +18,6 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import BRIDGE_S
 
-BLOCK_TIME_CONSTANTS = 300.0
-"""Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, does not overflow."""
-
-FULL_DECAY = 50.0
-"""Time constants after which a state has decayed completely (2·10⁻²²)."""
-
 
 def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArray:
     """Return y_k = e^(−decay_k)·y_{k−1} + drive_k with y_0 = start, shape (n + 1,).
@@ -37,12 +31,14 @@ def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArr
     """
     result = np.empty(decay.size + 1)
     result[0] = start
-    # Limiting each step to `FULL_DECAY` keeps e^elapsed finite.
+    # A state has decayed completely after 50 time constants (2·10⁻²²), and blocks of 300 are summed
+    # at a time: e³⁵⁰ does not overflow.
+    block = 300.0
     elapsed = np.zeros(decay.size + 1)
-    np.cumsum(np.minimum(decay, FULL_DECAY), out=elapsed[1:])
+    np.cumsum(np.minimum(decay, 50.0), out=elapsed[1:])
     edges = [0, decay.size]
-    if elapsed[-1] > BLOCK_TIME_CONSTANTS:
-        blocks = np.arange(BLOCK_TIME_CONSTANTS, elapsed[-1], BLOCK_TIME_CONSTANTS)
+    if elapsed[-1] > block:
+        blocks = np.arange(block, elapsed[-1], block)
         edges[1:1] = np.searchsorted(elapsed[1:], blocks).tolist()
     last = start
     for first, after in itertools.pairwise(edges):

@@ -12,12 +12,6 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.model.voltage_model import VoltageModel
 
-TOLERANCE_PCT = 1e-9
-"""Step size at which the iteration stops [% SoC]."""
-
-STEPS_AT_MOST = 80
-"""Bisection alone needs 37 steps from 100 % to the tolerance."""
-
 
 def soc_from_ocv(
     ocv_at: Callable[[float], tuple[float, float]], ocv_v: float, guess_pct: float = 50.0
@@ -46,7 +40,7 @@ def soc_from_ocv(
         if is_beyond(end_v):
             return end, ocv_v == end_v
     soc = min(max(guess_pct, low), high)
-    for _ in range(STEPS_AT_MOST):
+    for _ in range(80):  # bisection alone needs 37 steps to the tolerance
         volts, slope = ocv_at(soc)
         error = volts - ocv_v
         if error > 0.0:
@@ -54,27 +48,20 @@ def soc_from_ocv(
         else:
             low = soc
         following = soc - error / slope
-        if abs(following - soc) < TOLERANCE_PCT:
+        if abs(following - soc) < 1e-9:  # %
             return min(max(following, 0.0), 100.0), True
         soc = following if low < following < high else 0.5 * (low + high)
     return soc, True
 
 
-INVERSE_POINTS = 4001
-"""Points of the curve between which the first guess is interpolated."""
-
-INVERSE_STEPS = 6
-"""Newton steps from there; the error squares in each, from 0.03 % to below 1e-9 %."""
-
-
 def socs_from_ocv(model: VoltageModel, ocv_v: FloatArray) -> FloatArray:
     """Return `soc_from_ocv` of many voltages [%], shape (n,)."""
-    grid = np.linspace(0.0, 100.0, INVERSE_POINTS)
+    grid = np.linspace(0.0, 100.0, 4001)
     curve_v = model.curve.values(grid)
-    place = np.clip(np.searchsorted(curve_v, ocv_v), 1, INVERSE_POINTS - 1)
+    place = np.clip(np.searchsorted(curve_v, ocv_v), 1, grid.size - 1)
     low, high = grid[place - 1], grid[place]
     soc = np.interp(ocv_v, curve_v, grid)
-    for _ in range(INVERSE_STEPS):
+    for _ in range(6):  # the error squares in each, from 0.03 % to below 1e-9 %
         error = model.curve.values(soc) - ocv_v
         soc = np.clip(soc - error / model.curve.slopes(soc), low, high)
     return np.clip(soc, 0.0, 100.0)

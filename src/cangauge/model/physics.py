@@ -2,24 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from cangauge.errors import InputError
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST
 from cangauge.model.noise import Noise
 from cangauge.model.voltage_model import HermiteCurve, VoltageModel
-
-HIGHEST_VOLTS: Final = 1e4
-"""Largest pseudo-OCV [V]: electrical systems of vehicles and stores stay below 1.5 kV."""
-VOLTAGE_RATIO: Final = 3.0
-"""Largest ratio of the pseudo-OCV of a full pack to that of an empty one [-]: lithium cells are
-used between 2.0 and 4.4 V, lead and nickel cells over a narrower range."""
-DROP_AT_1C: Final = 1.0
-"""Largest voltage that one resistance drops at 1 C, relative to the pseudo-OCV [-]: such a pack
-could not be discharged in an hour at all. 0.02 for a Leaf, 0.3 for a small cell in the cold."""
-SLOPE_BY_TEMPERATURE: Final = 0.01
-"""Largest temperature coefficient relative to the pseudo-OCV [1/K]; 0.002 as published for a Leaf,
-0.0003 by the entropy of the cells."""
 
 
 def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:
@@ -37,13 +23,17 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
     middle = model.nominal_v
     ends = model.pseudo_ocv([*model.range.soc_pct]).tolist()
     low, high = min(*ends, middle), max(*ends, middle)
-    if not (low > 0.0 and high <= min(HIGHEST_VOLTS, VOLTAGE_RATIO * low)):
+    # Lithium cells are used between 2.0 and 4.4 V, lead and nickel cells over a narrower range;
+    # vehicles and stores stay below 1.5 kV.
+    if not (low > 0.0 and high <= min(1e4, 3.0 * low)):
         raise InputError(
             f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
             field="curve.voltage_v" if knots else prefix,
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-    loads, most_ohm = model.loads, DROP_AT_1C * middle / capacity_ah
+    # With all of its voltage dropped at 1 C a pack could not be discharged in an hour at all: 0.02
+    # for a Leaf, 0.3 for a small cell in the cold.
+    loads, most_ohm = model.loads, middle / capacity_ah
     limits = [
         (
             f"{prefix}.resistance_ohm.{k}" if knots else f"{prefix}.R{k + 1}",
@@ -54,7 +44,8 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
         for k, ohm in enumerate(loads.resistance_ohm)
     ]
     kt = f"{prefix}.{'kt_v_per_k' if knots else 'kt'}"
-    limits.append((kt, loads.kt_v_per_k, SLOPE_BY_TEMPERATURE * middle, "V/K"))
+    # Relative to the voltage 0.002 as published for a Leaf, 0.0003 by the entropy of the cells.
+    limits.append((kt, loads.kt_v_per_k, 0.01 * middle, "V/K"))
     noises = ("level_std_v", "slow_std_v", "fast_std_v")
     limits += [(f"noise.{name}", getattr(noise, name), middle, "V") for name in noises]
     for field, value, most, unit in limits:

@@ -29,8 +29,6 @@ from cangauge._typing import FloatArray
 from cangauge.model.voltage_model import (
     DELAYS_S,
     KNOTS_PCT,
-    LEAF_2012_CELLS,
-    LEAF_2012_OCV_V,
     REFERENCE_C,
     Functions,
     Loads,
@@ -71,10 +69,9 @@ the sensor does not see; Reynier, Yazami, Fultz, J. Power Sources 119–121 (200
 RESISTANCE_H: Final = ((0.012, 0.012), *((0.002, 0.004),) * (len(DELAYS_S) + len(LOW_PASS_S) - 1))
 """Mean and standard deviation of each resistance [h], times V0/C in ohms: a cell of energy type
 drops 2 % of its voltage at 1 C, half of it at once."""
-B_MEAN: Final = 1.0
-"""Factor on the Arrhenius change: all of the resistance follows a(T)."""
-B_STD: Final = 0.5
-"""Its standard deviation: contacts and leads do not follow a(T)."""
+B: Final = (1.0, 0.5)
+"""Mean and standard deviation of the factor on the Arrhenius change [-]: all of the resistance
+follows a(T), but for contacts and leads."""
 RESIDUAL_STD: Final = 0.003
 """Rms residual of a pack without logs, relative to V0; also the voltage noise against which an
 uncertain SoC is weighed: the published model leaves 0.25 %."""
@@ -88,13 +85,6 @@ SLOW_SHARE: Final = 0.4
 """Share of the residuals that is slow [-]: development packs."""
 FAST_FLOOR: Final = 0.0003
 """Least noise of a block's mean, relative to the mean voltage [-]: development packs."""
-
-TYPICAL_C_RATE: Final = 1.0 / 3.0
-"""Current of a drive [1/h] by which the functions weigh errors of resistances: 20 A at 60 Ah."""
-TYPICAL_K: Final = 10.0
-"""Temperature difference by which they weigh errors of kt [K]: a season's change within a day."""
-TYPICAL_COLDER: Final = 0.5
-"""Arrhenius change a(T)/a(T̄) − 1 by which they weigh errors of b [-]: 12 K colder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +150,10 @@ _LAYERED_V: Final = _curve(
         100: 4.14,
     }
 )
-_SPINEL_V: Final = PublishedCurve(LEAF_2012_OCV_V).values(KNOTS_PCT) / LEAF_2012_CELLS
+_LEAF_2012: Final = PublishedCurve(
+    (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)  # k0 … k7 [V], of 96 cells
+)
+_SPINEL_V: Final = _LEAF_2012.values(KNOTS_PCT) / 96
 _PHOSPHATE_V: Final = _curve(
     {
         0: 2.70,
@@ -314,11 +307,12 @@ class PackPrior:
         else:
             cells, start, level_std = self.cells, 100.0, FULL_STD
         h_mean, h_std = np.array(RESISTANCE_H).T * mean_v / self.capacity_ah
-        std = np.r_[KT_STD * mean_v, h_std, B_STD]
+        b_mean, b_std = B
+        std = np.r_[KT_STD * mean_v, h_std, b_std]
         covariance = np.zeros((n + std.size, n + std.size))
         covariance[:n, :n] = (shape_covariance(start, chemistry) + level_std**2) * mean_v**2
         covariance[n:, n:] = np.diag(std**2)
-        mean = np.r_[cells * chemistry.curve_v, 0.0, -h_mean, B_MEAN]
+        mean = np.r_[cells * chemistry.curve_v, 0.0, -h_mean, b_mean]
         return Distribution(mean, covariance, -h_mean, RESIDUAL_STD * mean_v, mean_v, REFERENCE_C)
 
 
@@ -339,11 +333,11 @@ def principal_functions(
     capacity_ah : float
         [Ah].
     """
-    usual_a = TYPICAL_C_RATE * capacity_ah
-    usual = [TYPICAL_K, *[usual_a] * len(loads.resistance_ohm)]
+    usual_a, usual_k = 1.0 / 3.0 * capacity_ah, 10.0  # a drive; a season's change within a day
+    usual = [usual_k, *[usual_a] * len(loads.resistance_ohm)]
     if loads.arrhenius is not None:
         total_ohm = abs(float(np.sum(loads.arrhenius.resistance_ohm)))
-        usual.append(TYPICAL_COLDER * usual_a * total_ohm)
+        usual.append(0.5 * usual_a * total_ohm)  # a(T)/a(T̄) − 1 where it is 12 K colder
     basis = hermite_basis(np.linspace(0.0, 100.0, 401))
     n = KNOTS_PCT.size
     weight = np.zeros_like(covariance)

@@ -56,11 +56,6 @@ DELAYS_S = (0.0, 10.0, 30.0, 70.0)
 BASIS_NAMES = ("k0", "k1", "k2", "k3", "k4", "k5", "k6", "k7")
 """Coefficients of the published pseudo-OCV, in the order of the columns of `ocv_basis`."""
 
-LEAF_2012_OCV_V = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
-"""Published k0 … k7 of a 2012 Nissan Leaf [V]."""
-LEAF_2012_CELLS = 96
-"""Its cells in series."""
-
 ACTIVATION_K = 3000.0
 """Activation temperature of the resistance [K]: 25 kJ/mol, that of charge transfer and electrolyte
 in lithium cells; Waldmann et al., J. Power Sources 262 (2014) 129."""
@@ -71,19 +66,10 @@ REFERENCE_C = 20.0
 PLAUSIBLE_C = (-60.0, 120.0)
 """Pack temperatures beyond which every law of temperature is constant [°C]."""
 
-TEMPERATURE_MARGIN_K = 5.0
-"""Extrapolation of the published temperature term beyond the identified range [K]."""
-
 SLOPE_AT_LEAST = 2e-5
 """Lower limit of the curve's slope per % SoC, relative to the pack voltage: it must rise for a
 unique inverse, yet allow a flat (LFP) plateau. 7 mV per % for a Leaf, 1/50 of its flattest
 slope."""
-
-SLOPE_POINTS = 401
-"""Points over the identified SoC at which the slope of the published curve is checked."""
-
-NARROWEST_SOC_PCT = 0.01
-"""Least width of the identified SoC range [%]: below, slopes are quotients of rounding errors."""
 
 EDGE = 0.25
 """Fraction of the identified SoC range at each end whose mean slope extrapolates the published
@@ -319,7 +305,7 @@ class PublishedCurve:
 
     def __post_init__(self) -> None:
         low, high = self.soc_range_pct
-        if not high - low >= NARROWEST_SOC_PCT:
+        if not high - low >= 0.01:  # below, slopes are quotients of rounding errors
             raise InputError("the range is empty", field="soc_range_pct", value=(low, high))
         ends = _scaled_soc([low, high], self.epsilon)
         if not np.all((ends > 0.0) & (ends < 1.0)):
@@ -329,7 +315,7 @@ class PublishedCurve:
                 value=(low, high),
                 cure="identify the model with a larger epsilon",
             )
-        points = np.linspace(low, high, SLOPE_POINTS)
+        points = np.linspace(low, high, 401)
         slope = self.slopes(points)
         if not np.all(slope > 0.0):
             worst = int(np.argmin(slope))
@@ -503,8 +489,8 @@ class VoltageModel:
         """Temperatures beyond which the load columns are constant [°C]."""
         if self.loads.arrhenius is not None:
             return PLAUSIBLE_C
-        low, high = self.range.temperature_c
-        return low - TEMPERATURE_MARGIN_K, high + TEMPERATURE_MARGIN_K
+        low, high = self.range.temperature_c  # the published term is extrapolated by 5 K
+        return low - 5.0, high + 5.0
 
     @cached_property
     def load_coefficients(self) -> FloatArray:

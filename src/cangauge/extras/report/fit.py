@@ -194,7 +194,7 @@ def _resistance_figure(result: Identification) -> Figure:
         hover="$name<br>@x{0.0} A, @y{0.00} V",
         height=360,
     )
-    current = np.concatenate([item.rows.currents_a[:, 0] for item in result.fits])
+    current = np.concatenate([item.rows.current_a for item in result.fits])
     drop = np.concatenate([item.rows.voltage_v - item.pseudo_ocv_v for item in result.fits])
     figure.cloud("rows of the fit", current, drop)
     ends = np.array([current.min(), current.max()])

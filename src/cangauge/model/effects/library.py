@@ -18,9 +18,6 @@ from cangauge.model.effects.voltages import VOLTAGES
 LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in (*CORRECTIONS, *COUNTS, *VOLTAGES)}
 """Effect id → effect, in the order in which effects are applied."""
 
-STEP = 0.02
-"""Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
-
 
 def effect_of(effect_id: object, field: str = "effects") -> Effect:
     """Return the effect with an id.
@@ -148,7 +145,7 @@ def candidates(effects: Sequence[Effect], pack: Pack) -> list[EffectCandidate]:
         names = tuple(parameter.name for parameter in amplitudes)
         centre = np.array([neutral[name] for name in names])
         bounds = np.array([parameter.bounds(pack) for parameter in amplitudes]) - centre[:, None]
-        small = STEP * (bounds[:, 1] - bounds[:, 0])
+        small = 0.02 * (bounds[:, 1] - bounds[:, 0])
         steps = np.where(small > bounds[:, 1], -small, small)
         shapes = effect.shapes if effect.amplitudes else ()
         grids = [parameter.trials(pack) for parameter in shapes]

@@ -32,9 +32,6 @@ SMOOTHING_S: Final = 200.0
 the steps of a sensor with whole degrees; the same for all lags, so that the effect is linear in
 `tau_s`."""
 
-STALE: Final = 64
-"""Currents that are not needed any more are dropped from this number on."""
-
 
 def offset_and_gain(values: Values) -> tuple[float, float]:
     """Return the error of a sensor, measured = gain·true + offset, by its only parameter."""
@@ -78,7 +75,7 @@ class _Waiting:
         self._waiting = self._waiting[:, ready:]
         upcoming_s = self._waiting[0, 0] if self._waiting.size else times[-1]
         stale = int(np.searchsorted(times, upcoming_s + self._skew_s, side="right")) - 1
-        if stale > STALE:
+        if stale > 64:  # not at each row
             self._currents = self._currents[:, stale:]
         return Signals(time_s, skewed, voltage_v, temperature_c)
 
