@@ -68,14 +68,11 @@ class CoreConstants:
     model, settings : Constants
         Fields of a `cg_model` without its effects, and of a `cg_settings`.
     effects : list of CoreForm
-    longest_s : float
-        Longest delay [s].
     """
 
     model: Constants
     settings: Constants
     effects: list[CoreForm]
-    longest_s: float
 
 
 def exported_constants(model: Model) -> CoreConstants:
@@ -96,17 +93,12 @@ def exported_constants(model: Model) -> CoreConstants:
             value=[entry["id"] for entry in model.effects],
             cure="fit the model without it",
         ) from lacking
-    return CoreConstants(
-        model_constants(estimator, forms),
-        settings_constants(estimator),
-        forms,
-        estimator.online.delay_line.longest_s,
-    )
+    return CoreConstants(model_constants(estimator, forms), settings_constants(estimator), forms)
 
 
-def line_size(longest_s: float, spacing_s: float) -> int:
+def line_size(constants: CoreConstants, spacing_s: float) -> int:
     """Return the length of a delay line, as `CG_LINE_SIZE`."""
-    return int(2.0 * longest_s / spacing_s) + 9
+    return int(2.0 * constants.model["delay_s"][-1] / spacing_s) + 9
 
 
 def initialiser(value: Any, field: str = "") -> str:

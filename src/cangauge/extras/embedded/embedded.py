@@ -106,7 +106,7 @@ def export_c(
     model = TabulatedModel.of(model)
     constants = exported_constants(model)
     spacing_s = JITTER * 2.0 * period_s
-    length = line_size(constants.longest_s, spacing_s)
+    length = line_size(constants, spacing_s)
     head = f"{_HEAD}{_comment(model.name)}, by cangauge {__version__}. */\n"
     folders = dict.fromkeys(CORE_HEADERS + CORE_SOURCES, "core")
     folders |= dict.fromkeys(EMBEDDED + FOXBMS * (platform == "foxbms"), "core/embedded")

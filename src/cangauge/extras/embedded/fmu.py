@@ -23,9 +23,9 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from cangauge._files import atomic_path
 from cangauge._resources import shared_file
@@ -34,7 +34,6 @@ from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.embedded.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
-    CoreConstants,
     exported_constants,
     initialiser,
     line_size,
@@ -125,26 +124,25 @@ DIVISORS: Final = {
 """Names of an effect's values by which the core divides → range."""
 
 
-@dataclass(frozen=True)
-class Variable:
+class Variable(NamedTuple):
     """A variable of a unit; its value reference is its place."""
 
     name: str
     causality: Literal["independent", "input", "output", "parameter"]
-    unit: str | None
-    start: float | None
     description: str
+    unit: str | None = None
+    start: float | None = None
     is_integer: bool = False
     range: tuple[float, float] | None = None
     """Lowest and highest value that can be set; None: any, NaN too."""
 
     def xml(self, reference: int) -> str:
         """Return the variable's element of the description."""
-        variability, initial = "discrete" if self.is_integer else "continuous", ""
+        variability = "discrete" if self.is_integer else "continuous"
         if self.causality == "parameter":
-            variability, initial = "fixed", ' initial="exact"'
-        elif self.causality == "output":
-            initial = ' initial="calculated"'
+            variability = "fixed"
+        initials = {"parameter": ' initial="exact"', "output": ' initial="calculated"'}
+        initial = initials.get(self.causality, "")
         low, high = self.range or FINITE
         values = {
             "min": None if low == FINITE[0] else low,
@@ -180,7 +178,7 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack") -> Path:
     CangaugeError
         If the compiler fails.
     """
-    unit = _Unit.of(model, exported_constants(model), kind)
+    unit = _Unit(model, kind)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         unit.write_sources(root / "sources")
@@ -193,40 +191,25 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack") -> Path:
     return path
 
 
-@dataclass(frozen=True)
 class _Unit:
     """What a unit is made of."""
 
-    identifier: str
-    kind: Kind
-    constants: CoreConstants
-    variables: tuple[Variable, ...]
-    parameters: dict[Variable, tuple[int, str]]
-    """Effect and place in C of each parameter of an effect: the last of the variables."""
-    token: str
-
-    @classmethod
-    def of(cls, model: Model, constants: CoreConstants, kind: Kind) -> _Unit:
-        parameters = {}
-        variables = _estimator_variables()
+    def __init__(self, model: Model, kind: Kind) -> None:
+        self.constants, self.kind = exported_constants(model), kind
+        self.parameters: dict[Variable, tuple[int, str]] = {}
+        """Effect and place in C of each parameter of an effect: the last of the variables."""
         if kind == "pack":
             forms = [
                 CoreForm("no_effect") if form.kind in SENSORS else form
-                for form in constants.effects
+                for form in self.constants.effects
             ]
-            constants = replace(constants, effects=forms)
-            parameters = _effect_parameters(forms)
-            variables = (*_pack_variables(model), *parameters)
+            self.constants = replace(self.constants, effects=forms)
+            self.parameters = _effect_parameters(forms)
+        self.variables = [*_variables(model, kind), *self.parameters]
         name = re.sub(r"\W+", "_", f"{kind} {model.name}", flags=re.ASCII).rstrip("_")
-        token = hashlib.sha256(f"{kind} {__version__} {model.to_json()}".encode())
-        return cls(
-            name[:LONGEST_NAME],
-            kind,
-            constants,
-            variables,
-            parameters,
-            token.hexdigest(),
-        )
+        self.identifier = name[:LONGEST_NAME]
+        token = f"{kind} {__version__} {model.to_json()}"
+        self.token = hashlib.sha256(token.encode()).hexdigest()
 
     @property
     def sources(self) -> list[str]:
@@ -245,7 +228,7 @@ class _Unit:
             "FMU_VARIABLES": len(self.variables),
             "FMU_PARAMETERS": len(self.parameters),
             "FMU_SPACING_S": SPACING_S,
-            "FMU_LINE": line_size(self.constants.longest_s, SPACING_S),
+            "FMU_LINE": line_size(self.constants, SPACING_S),
         }
         lines = [f"#define {name} {value}" for name, value in config.items()]
         (folder / "fmu_config.h").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -293,83 +276,63 @@ class _Unit:
         )
 
 
-TIME: Final = Variable("time", "independent", "s", None, "time")
-CURRENT: Final = Variable("current_a", "input", "A", 0.0, "current, positive = discharge")
-SOC: Final = Variable("soc_pct", "output", "%", None, "state of charge")
-
-
-def _pack_variables(model: Model) -> tuple[Variable, ...]:
-    return (
-        TIME,
-        CURRENT,
-        Variable(
-            "temperature_c",
-            "input",
-            "degC",
-            model.voltage_model().loads.t_ref_c,
-            "measured temperature",
-        ),
-        Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
-        SOC,
-        Variable(
-            "initial_soc_pct",
-            "parameter",
-            "%",
-            50.0,
-            "state of charge at the start",
-            range=(0.0, 100.0),
-        ),
-        Variable(
-            "capacity_ah",
-            "parameter",
-            "A.h",
-            model.extended_model().counting(50.0).capacity_ah,
-            "charge from full to empty",
-            range=AMPERE_HOURS,
-        ),
+def _variables(model: Model, kind: Kind) -> list[Variable]:
+    """Return the variables of a unit but for the parameters of effects."""
+    extended, is_pack = model.extended_model(), kind == "pack"
+    usual_c = extended.model.loads.t_ref_c if is_pack else 20.0
+    start = Variable(
+        "initial_soc_pct",
+        "parameter",
+        "state of charge at the start",
+        "%",
+        50.0,
+        range=(0.0, 100.0),
     )
-
-
-def _estimator_variables() -> tuple[Variable, ...]:
-    return (
-        TIME,
-        CURRENT,
-        Variable("temperature_c", "input", "degC", 20.0, "measured temperature"),
-        Variable("voltage_v", "input", "V", 0.0, "measured voltage"),
-        SOC,
+    found = [
+        Variable("time", "independent", "time", "s"),
+        Variable("current_a", "input", "current, positive = discharge", "A", 0.0),
+        Variable("temperature_c", "input", "measured temperature", "degC", usual_c),
+        Variable("voltage_v", "input", "measured voltage", "V", 0.0),
+        Variable("soc_pct", "output", "state of charge", "%"),
+    ]
+    if is_pack:
+        found[3] = Variable("voltage_v", "output", "voltage at the terminals", "V")
+        capacity_ah = extended.counting(50.0).capacity_ah
+        what = "charge from full to empty"
+        capacity = Variable(
+            "capacity_ah", "parameter", what, "A.h", capacity_ah, range=AMPERE_HOURS
+        )
+        return [*found, start, capacity]
+    text = f"{start.description}; negative: found from the first voltages"
+    return [
+        *found,
+        start._replace(description=text, start=-1.0, range=(-1.0, 100.0)),
+        Variable("soc_std_pct", "output", "its standard deviation", "%"),
         Variable(
-            "initial_soc_pct",
-            "parameter",
-            "%",
-            -1.0,
-            "state of charge at the start; negative: found from the first voltages",
-            range=(-1.0, 100.0),
+            "status", "output", "0 initialising, 1 valid, 2 degraded, 3 invalid", is_integer=True
         ),
-        Variable("soc_std_pct", "output", "%", None, "its standard deviation"),
-        Variable(
-            "status", "output", None, None, "0 initialising, 1 valid, 2 degraded, 3 invalid", True
-        ),
-        Variable("reasons", "output", None, None, "bits, as CG_… in cangauge.h", True),
-        Variable("soc_newton_pct", "output", "%", None, "by the voltage model alone"),
-        Variable("soc_coulomb_pct", "output", "%", None, "by counting alone"),
-        Variable("voltage_model_v", "output", "V", None, "predicted voltage"),
-    )
+        Variable("reasons", "output", "bits, as CG_… in cangauge.h", is_integer=True),
+        Variable("soc_newton_pct", "output", "by the voltage model alone", "%"),
+        Variable("soc_coulomb_pct", "output", "by counting alone", "%"),
+        Variable("voltage_model_v", "output", "predicted voltage", "V"),
+    ]
 
 
 def _effect_parameters(forms: Sequence[CoreForm]) -> dict[Variable, tuple[int, str]]:
     """Return the effects' constants as variables, with effect and place in C of each."""
     found = {}
     for number, form in enumerate(forms):
-        text = f"effect {number + 1} of the model, as in cangauge.h"
         prefix = f"effect_{number + 1}_{form.kind}"
+        text = f"effect {number + 1} of the model, as in cangauge.h"
+        parameter = Variable(prefix, "parameter", text)
         named = zip(VALUES.get(form.kind, ()), form.values, strict=False)
         for place, (name, value) in enumerate(named):
             bounds = DIVISORS.get(name, FINITE)
-            variable = Variable(f"{prefix}.{name}", "parameter", None, value, text, range=bounds)
+            variable = parameter._replace(name=f"{prefix}.{name}", start=value, range=bounds)
             found[variable] = number, f"{place}"
         for place, value in enumerate(form.tau_s):
             name = f"{prefix}.tau_{place + 1}_s"
-            variable = Variable(name, "parameter", None, value, text, range=TAU_S)
+            variable = parameter._replace(name=name, start=value, range=TAU_S)
             found[variable] = number, f"CG_VALUES + {place}"
     return found
 
