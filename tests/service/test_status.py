@@ -20,7 +20,7 @@ from watched import StandInPort, Watched
 from cangauge.cli.status import live_text, status_values
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.cells import CellReport
-from cangauge.service.run import COUNTED, log_end
+from cangauge.service.run import COUNTED, Service, log_end
 from cangauge.service.status import Histogram
 from cangauge.service.status_client import (
     BOUNDS_S,
@@ -30,7 +30,7 @@ from cangauge.service.status_client import (
     find_socket,
     socket_path,
 )
-from live import Command, LoggedLines, in_process, waits
+from live import Command, LoggedLines, in_process, leaf_model_path, waits
 
 
 @pytest.fixture
@@ -377,3 +377,16 @@ def test_a_socket_survives_a_lack_of_descriptors(
 
     assert waits(lambda: is_answered() and bool(failures))
     assert is_answered()
+
+
+def test_a_service_runs_without_a_socket_that_it_was_not_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "file"))
+    bus = {"interface": "virtual", "channel": "no socket"}
+    service = Service(model=str(leaf_model_path()), duration_s=0.01, **bus)
+    with LoggedLines("cangauge.service.run") as logged:
+        assert service.run()["samples"] == 0
+    assert service.endpoint is None
+    assert any(line.startswith("warning: no status socket: ") for line in logged.lines)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from cangauge.bus.time_source import clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Reason
-from live import frames_of, leaf_model, short_log
+from live import frames_of, leaf_model, short_log, virtual_port, virtual_service, waits
 
 VOLTAGE = 0x401
 
@@ -41,3 +42,19 @@ def test_a_voltage_that_no_longer_pairs_becomes_missing() -> None:
 def test_a_voltage_that_comes_seldom_is_not_missing() -> None:
     found = reasons_after(20.0, shift_s=0.0, every=10)
     assert not any(each & Reason.VOLTAGE_MISSING for each in found.values())
+
+
+def test_the_service_says_how_to_pair_them() -> None:
+    """On log time, so that nothing waits for it."""
+    settings = PipelineSettings(time_source="replay-clock")
+    frames = frames_of(short_log(20.0))
+    for frame in frames:
+        if frame.arbitration_id == VOLTAGE:
+            frame.timestamp += 0.05
+    bus = virtual_port("unpaired")
+    with virtual_service("unpaired", settings) as service:
+        for frame in sorted(frames, key=lambda each: each.timestamp):
+            bus.send(clock_frame(round(1e6 * frame.timestamp)))
+            bus.send(frame)
+        assert waits(lambda: any("pair_within_s" in line for line in service.warnings))
+    bus.close()
