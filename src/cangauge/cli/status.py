@@ -191,7 +191,7 @@ def pack_values(report: Mapping[str, Any]) -> dict[str, str]:
             currents = power[f"{way}_a"], power[f"{way}_std_a"]
             values[f"possible {way}, 10 s"] = possible(*currents, "A")
         left = energy_text(power["energy_wh"], power["energy_std_wh"])
-        to_pct = power.get("energy_to_soc_pct")  # services of earlier releases do not state it
+        to_pct = power["energy_to_soc_pct"]
         values["energy left"] = left if to_pct is None else f"{left} to {to_pct:.0f} % SoC"
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "

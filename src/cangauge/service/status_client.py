@@ -97,10 +97,6 @@ class NotRunningError(CangaugeError):
     """No service answers."""
 
 
-class EndedError(NotRunningError):
-    """Nothing listens on the socket, or it is gone: the service has ended."""
-
-
 def runtime_folders() -> list[Path]:
     """Return the folders for sockets, the preferred one first."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
@@ -230,7 +226,7 @@ def fetch_status(path: Path) -> dict[str, Any]:
     Raises
     ------
     NotRunningError
-        If no service answers; `EndedError` if nothing listens.
+        If no service answers.
     CangaugeError
         If the answer is not a status.
     """
@@ -241,9 +237,8 @@ def fetch_status(path: Path) -> dict[str, Any]:
                 answer += part
                 connection.settimeout(max(until_s - time.monotonic(), 1e-3))
     except OSError as error:
-        has_ended = isinstance(error, (ConnectionRefusedError, FileNotFoundError))
-        kind = EndedError if has_ended else NotRunningError
-        raise kind(f"{path}: no service answers: {error.strerror or error}") from error
+        text = f"{path}: no service answers: {error.strerror or error}"
+        raise NotRunningError(text) from error
     try:
         content = json.loads(answer)
         if content["schema"] == SCHEMA:

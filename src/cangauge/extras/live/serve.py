@@ -24,10 +24,10 @@ from cangauge.service.events import logging_to, release_held
 from cangauge.service.output import Output
 from cangauge.service.status_client import (
     SHOW_EVERY_S,
-    EndedError,
     NotRunningError,
     Snapshot,
     fetch_status,
+    is_served,
 )
 
 NICE: Final = 5
@@ -97,13 +97,14 @@ async def _serve(endpoint: Path, config: RunConfig, bus: str) -> None:
         os.nice(NICE)  # once it has started
         while True:
             began_s = time.monotonic()
-            # A service that does not answer shows as one whose latest status grows old.
-            with suppress(NotRunningError):
-                try:
-                    status = await asyncio.to_thread(fetch_status, endpoint)
-                except EndedError:
+            try:
+                status = await asyncio.to_thread(fetch_status, endpoint)
+            except NotRunningError:
+                # One that hangs shows as one whose latest status grows old.
+                if not await asyncio.to_thread(is_served, endpoint):
                     emit(_LOG, logging.INFO, "live.ended", f"the service at {endpoint} has ended")
                     return
+            else:
                 snapshot = Snapshot(time.monotonic(), status)
                 for output in outputs:
                     output.on_snapshot(snapshot)
