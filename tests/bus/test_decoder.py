@@ -10,11 +10,11 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
-from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.decoder import Pairing, SampleDecoder
 from cangauge.bus.open import bus_address
 from cangauge.bus.protection import RULES
@@ -218,7 +218,7 @@ def test_codes_and_signs_of_a_bmw_i3() -> None:
 
 
 def test_an_extended_id_of_the_dbc_is_wanted() -> None:
-    signal = replace(GENERIC.current, key=0x18FF0001 | EXTENDED)
+    signal = replace(GENERIC.current, key=0x18FF0001 | CAN_EFF_FLAG)
     messages = {**GENERIC.messages, signal.key: GENERIC.messages[CURRENT_ID]}
     vehicle = replace(GENERIC, current=signal, messages=messages)
     assert vehicle.wanted_ids[0] == 0x18FF0001
@@ -236,7 +236,7 @@ def test_a_service_on_udp_takes_64_bytes(tmp_path: Path) -> None:
 PGN_ID = 0x18F01D27  # PGN 0xF01D from source 0x27
 TRUCK = f"""VERSION "1"
 BU_: V
-BO_ {PGN_ID | EXTENDED} HVESSD1: 8 V
+BO_ {PGN_ID | CAN_EFF_FLAG} HVESSD1: 8 V
  SG_ Voltage : 0|16@1+ (0.05,0) [0|0] "V" V
  SG_ Current : 16|16@1+ (0.05,-1600) [0|0] "A" V
 """

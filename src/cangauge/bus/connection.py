@@ -27,9 +27,6 @@ AT_ONCE: Final = 64
 _RETRY_S: Final = 0.001
 """Interval at which a frame is retried while the transmit queue is full [s]: half a frame of a slow
 bus."""
-_BUS_OFF: Final = 0x040
-_RESTARTED: Final = 0x100
-"""Classes of error frames: bits of their id (linux/can/error.h)."""
 
 
 class BusError(CangaugeError):
@@ -216,9 +213,9 @@ class BusConnection:
 
     def _note_error_frame(self, message: can.Message) -> None:
         self.error_frames += 1
-        if self.address.interface == "socketcan":  # elsewhere the id has no classes
-            classes = message.arbitration_id
-            self.is_off = bool(classes & _BUS_OFF or (self.is_off and not classes & _RESTARTED))
+        if self.address.interface == "socketcan":  # bits of linux/can/error.h; elsewhere none
+            bus_off, restarted = (message.arbitration_id & bit for bit in (0x040, 0x100))
+            self.is_off = bool(bus_off or (self.is_off and not restarted))
 
     def _failure(self, action: str, error: Exception) -> BusError:
         cause = " ".join(str(error.__cause__ or error).split()) or type(error).__name__

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG
+
 from cangauge.errors import InputError
 
 MOST_BYTES: Final = 4095
@@ -22,8 +24,6 @@ MOST_BYTES: Final = 4095
 _MOST_ENTRIES: Final = 1 << 17
 """Most entries in cantools' tables of multiplexed signals, of which it makes 60,000 a second: two
 signals for every value of 16 bits."""
-EXTENDED: Final = 1 << 31
-"""Flag of an extended id in a DBC and in a message key, as in SocketCAN."""
 _UNASSIGNED: Final = "VECTOR__INDEPENDENT_SIG_MSG"
 """Message of editors for signals that are in no message; cantools leaves it out."""
 
@@ -89,7 +89,7 @@ def _blank(quoted: re.Match[str]) -> str:
 def _with_flags(text: str, ids: list[re.Match[str]]) -> str:
     parts, place = [], 0
     for match in ids:
-        parts += [text[place : match.start(1)], str(int(match[1]) | EXTENDED)]
+        parts += [text[place : match.start(1)], str(int(match[1]) | CAN_EFF_FLAG)]
         place = match.end(1)
     return "".join([*parts, text[place:]])
 

@@ -11,10 +11,10 @@ from typing import Final, cast, get_args
 
 import can
 import numpy as np
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG
 
 from cangauge._typing import FloatArray
 from cangauge.bus.database import BitField, SignalCodec
-from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
 from cangauge.bus.mapping import CellsMap
 from cangauge.bus.plausibility import (
@@ -323,10 +323,10 @@ class SampleDecoder:
             return None
         key, time_s, data = message.arbitration_id, message.timestamp, message.data
         if message.is_extended_id:
-            key |= EXTENDED
+            key |= CAN_EFF_FLAG
         wanted = self._wanted.get(key)
         if wanted is None:
-            if self._by_pgn and key & EXTENDED:
+            if self._by_pgn and key & CAN_EFF_FLAG:
                 wanted = self._wanted.get(self._by_pgn.get(key & pgn_mask(key), -1))
             elif key in self._replies:
                 reply = self._replies[key].take(data, time_s)

@@ -56,23 +56,24 @@ class Reassembler:
             return None
         kind, low = data[0] >> 4, data[0] & 0x0F
         if kind == SINGLE:
-            self._length = 0
             # CAN FD: the length is in the second byte.
             start, length = (2, data[1]) if low == 0 and len(data) > 8 else (1, low)
+            self._length = 0
             return bytes(data[start : start + length]) if 0 < length <= len(data) - start else None
         if kind == FIRST and len(data) >= 2:
             self._payload, length = bytearray(data[2:]), low << 8 | data[1]
             self._length = length if length > len(self._payload) else 0
             self._sequence, self._last_s = 1, time_s
         elif kind == CONSECUTIVE and self._length:
-            if low != self._sequence & 0x0F or not 0.0 <= time_s - self._last_s <= LONGEST_GAP_S:
+            length, is_late = self._length, not 0.0 <= time_s - self._last_s <= LONGEST_GAP_S
+            if low != self._sequence & 0x0F or is_late:
                 self._length = 0
                 return None
             self._sequence, self._last_s = self._sequence + 1, time_s
             self._payload += data[1:]
-            if len(self._payload) >= self._length:
-                reply, self._length = bytes(self._payload[: self._length]), 0
-                return reply
+            if len(self._payload) >= length:
+                self._length = 0
+                return bytes(self._payload[:length])
         return None
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 from cantools.database.can import Message
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import AliasChoices, Field, PositiveFloat, model_validator
 
 from cangauge._config import read_toml
 from cangauge.bus.database import BitField
@@ -28,14 +28,11 @@ from cangauge.bus.protection import (
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CELLS_AT_MOST
 from cangauge.logs.column_map import ColumnMap
+from cangauge.model.fields import Fields
 from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource, VoltageAccuracyPct
 
 COUNTER: Final = "counter"
 """Protection by a counter alone."""
-
-
-class _MapTable(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class SignalMap(SignalChecks):
@@ -82,7 +79,7 @@ class TemperatureMap(SignalMap):
         return self
 
 
-class CellsMap(_MapTable):
+class CellsMap(Fields):
     """Voltages of the cells in series: one signal a cell, or groups numbered by a signal.
 
     `signal` and `message` are names with "{n}" for the cell's number, from `first` on; or the raw
@@ -138,7 +135,7 @@ def _numbered(name: str | int | None, number: int) -> str | int | None:
     return name.format(n=number) if isinstance(name, str) else name
 
 
-class MessageMap(_MapTable):
+class MessageMap(Fields):
     """Protection and period of a message.
 
     `protection` is one of `protection.RULES`, of [rules] or of `protection.PROFILES` (see `E2eRule`
@@ -169,14 +166,12 @@ class MessageMap(_MapTable):
         field or has one of another protection.
         """
         name, known = self.protection, {**RULES, **rules}
-        names = _FIELDS_OF_COUNTER + _FIELDS_OF_PROFILES
-        stated = {each: getattr(self, each) for each in names if getattr(self, each) is not None}
-        for stated_name in stated:
-            of_counter = stated_name in _FIELDS_OF_COUNTER
-            if not (name == COUNTER if of_counter else name in PROFILES):
-                owner = f'"{COUNTER}"' if of_counter else "an e2e profile"
-                cure = f"set protection to {owner}, or remove this field"
-                raise InputError(f"belongs to {owner}", field=stated_name, cure=cure)
+        owner = f'"{COUNTER}"' if name == COUNTER else "an e2e profile" if name in PROFILES else ""
+        stated = self.model_dump(include=set(_OWNERS), exclude_none=True)
+        for field in stated:
+            if _OWNERS[field] != owner:
+                cure = f"set protection to {_OWNERS[field]}, or remove this field"
+                raise InputError(f"belongs to {_OWNERS[field]}", field=field, cure=cure)
         rule: Protection
         if name is None:
             return None
@@ -207,17 +202,17 @@ class MessageMap(_MapTable):
         return CounterRule(bits, self.counter_modulus or 1 << bits.width)
 
 
-_FIELDS_OF_COUNTER: Final = ("counter", "counter_modulus")
-_FIELDS_OF_PROFILES: Final = (
-    "data_id",
-    "data_id_list",
-    "data_id_mode",
-    "header_byte",
-    "protected_bytes",
-)
+_OWNERS: Final = {
+    **dict.fromkeys(["counter", "counter_modulus"], f'"{COUNTER}"'),
+    **dict.fromkeys(
+        ["data_id", "data_id_list", "data_id_mode", "header_byte", "protected_bytes"],
+        "an e2e profile",
+    ),
+}
+"""The protection to which a field of a message belongs."""
 
 
-class VehicleMap(_MapTable):
+class VehicleMap(Fields):
     """Content of a map file.
 
     `dbc` are files relative to it. The temperature may be given as an option; `soc_reference`

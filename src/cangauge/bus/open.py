@@ -43,14 +43,6 @@ RECEIVE_BUFFER_BYTES: Final = 16 << 20
 """Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
 CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
-_BUFFER_OPTIONS: Final = (socket.SO_RCVBUF, *([33] if sys.platform == "linux" else []))
-"""Options that set the size of the receive buffer: the second is SO_RCVBUFFORCE."""
-_OWN_GROUP_ONLY: Final = {
-    socket.AF_INET: (socket.IPPROTO_IP, 49),
-    socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
-}
-"""IP_MULTICAST_ALL and IPV6_MULTICAST_ALL: while set, as by default, a socket receives the packets
-of every group that any program of the machine has joined. Other systems have no such option."""
 _DEFAULT_CHANNELS: Final = {
     "socketcan": "vcan0",
     "udp_multicast": MULTICAST_CHANNEL,
@@ -212,7 +204,8 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
         raise _refusal(address, error) from error
     if address.interface in _ON_SOCKETS and sys.platform != "win32":
         with socket_of(bus) as own:
-            for option in _BUFFER_OPTIONS:
+            forced = [33] if sys.platform == "linux" else []  # SO_RCVBUFFORCE
+            for option in (socket.SO_RCVBUF, *forced):
                 with suppress(OSError):  # the system may refuse, or cap the size silently
                     own.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
             # SocketCAN opens an interface that is down; the error comes with the next call.
@@ -358,9 +351,12 @@ class CheckedUdpBus(UdpMulticastBus):
         self._local_host = ""
         super().__init__(*args, **kwargs)
         if sys.platform == "linux":
-            # Kernels before 4.20 have none for IPv6.
-            with suppress(OSError), socket_of(self) as own:
-                own.setsockopt(*_OWN_GROUP_ONLY[own.family], 0)
+            # IP_MULTICAST_ALL, IPV6_MULTICAST_ALL (Linux 4.20): while set, as by default, a socket
+            # receives the packets of every group that any program of the machine has joined.
+            with socket_of(self) as own:
+                for level, option in ((socket.IPPROTO_IP, 49), (socket.IPPROTO_IPV6, 29)):
+                    with suppress(OSError):
+                        own.setsockopt(level, option, 0)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next frame; None if none came in time [s].

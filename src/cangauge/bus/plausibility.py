@@ -16,10 +16,11 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self
+from typing import Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import PositiveFloat, PositiveInt, model_validator
 
+from cangauge.model.fields import Fields
 from cangauge.types import (
     CURRENT_AT_MOST_A,
     SOC_WITHIN_PCT,
@@ -74,10 +75,7 @@ class PackProperties:
         return self.usual_v / max(self.resistance_ohm, self.usual_v / CURRENT_AT_MOST_A)
 
 
-_Count = Annotated[int, Field(ge=1, le=1000)]
-
-
-class SignalChecks(BaseModel):
+class SignalChecks(Fields):
     """Plausibility limits of a signal [A, positive = discharge; V; °C; %].
 
     A value may differ from the latest good one by `max_jump`, plus `max_rate_per_s` for every
@@ -87,14 +85,12 @@ class SignalChecks(BaseModel):
     is stated.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
     lowest: float = -math.inf
     highest: float = math.inf
     max_jump: PositiveFloat = math.inf
     max_rate_per_s: PositiveFloat = 0.0
-    invalid_after: _Count = 5
-    valid_after: _Count = 3
+    invalid_after: PositiveInt = 5
+    valid_after: PositiveInt = 3
     stuck_after_s: PositiveFloat | None = None
     timeout_s: PositiveFloat | None = None
 

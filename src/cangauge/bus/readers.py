@@ -24,19 +24,20 @@ from pathlib import Path
 from typing import IO, Any, ClassVar, Final, Literal, Self, cast
 
 import can
+from can.interfaces.socketcan.constants import CAN_ERR_FLAG, MSK_ARBID
 from can.io.blf import BLFParseError
 from can.io.generic import MessageReader, TextIOMessageReader
 from can.typechecking import StringPathLike
 
 from cangauge._files import open_unpacked
+from cangauge.bus.time_source import OUT_OF_ORDER_S
 from cangauge.errors import InputError
+from cangauge.estimation.counting import LATEST_S
 
 PYTHON_CAN: Final = "cangauge.extras.formats.python_can"
 """Module of the formats that python-can reads; loaded when a capture is opened."""
 MAX_LINE: Final = 16 * 1024
 """Longest line of a text capture [characters]."""
-MAX_STAMP_S: Final = 1e11
-"""Largest time stamp of a frame [s]: the year 5138, counted from 1970."""
 HEAD_LINES: Final = 400
 """First lines, by which a text format is recognised."""
 IDLE_LINES: Final = 1_000_000
@@ -47,19 +48,14 @@ FEW_MALFORMED: Final = 100
 PERIODS_S: Final = (1.0, 60.0, 3600.0, 2.0**32 / 1e6, 86400.0)
 """Times after which clocks of loggers start again [s]: fractions of a second, seconds of a minute
 (slcan, CARBUS), minutes of an hour, 32 bits of microseconds, and times of day."""
-OUT_OF_ORDER_S: Final = 1.0
-"""Largest step back of frames that a logger writes out of order [s]."""
 STALE_FRAMES: Final = 100
-STALE_S: Final = 86400.0
-"""First frames that a logger's buffer may have kept from before, and the least time before [s]."""
+"""First frames that a logger's buffer may have kept from before: more than a day, or ahead."""
 PAUSE_S: Final = 100.0
 """Pause that is put between sessions in one file [s]: no charge is counted over it."""
 FIRST_DATE_S: Final = 1e9
 """Stamps from here on are dates [s since 1970]: the year 2001."""
 MOST_BUSES: Final = 64
 """Most buses in a file, each of which has its own decoder; frames of further ones are malformed."""
-MAX_ID: Final = 0x1FFFFFFF
-ERROR_FLAG: Final = 0x20000000
 
 Stamps = Literal["us", "ms", "none"]
 """Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps."""
@@ -147,7 +143,7 @@ class CaptureReader(MessageReader, ABC):
         try:
             for message in self._frames():
                 is_known = message.channel in buses or len(buses) < MOST_BUSES
-                if is_known and abs(message.timestamp) <= MAX_STAMP_S:  # false for NaN
+                if is_known and abs(message.timestamp) <= LATEST_S:  # false for NaN
                     buses.add(message.channel)
                     if not self._is_bus_time:
                         message.timestamp = clock.running_s(message.channel, message.timestamp)
@@ -179,9 +175,9 @@ class CaptureReader(MessageReader, ABC):
         stale = 0
         for place, (one, two) in enumerate(pairwise(head[: len(head) // 2]), start=1):
             step_s = two.timestamp - one.timestamp
-            is_jump = step_s < -OUT_OF_ORDER_S or step_s > STALE_S
+            is_jump = step_s < -OUT_OF_ORDER_S or step_s > max(PERIODS_S)
             is_turn = _Clock.turn_s(one.timestamp, two.timestamp, OUT_OF_ORDER_S) > 0.0
-            is_usable = abs(two.timestamp) <= MAX_STAMP_S and one.channel == two.channel
+            is_usable = abs(two.timestamp) <= LATEST_S and one.channel == two.channel
             if is_usable and is_jump and not is_turn:
                 stale = place
         if stale:
@@ -371,7 +367,7 @@ def frame(
     """
     arbitration_id = int(number, 16) if isinstance(number, str) else number
     is_large = arbitration_id > 0x7FF
-    if not 0 <= arbitration_id <= MAX_ID or (is_large and is_extended is False):
+    if not 0 <= arbitration_id <= MSK_ARBID or (is_large and is_extended is False):
         raise ValueError("no such id")
     content = bytes.fromhex(data or "")
     size = len(content) if length is None else int(length or 0)
@@ -394,10 +390,10 @@ def candump_frame(
 ) -> can.Message:
     """Return a frame as candump writes it: ids of eight digits are extended, and have flags."""
     bits, is_extended = int(number, 16), len(number) == 8
-    is_error = is_extended and bool(bits & ERROR_FLAG)
+    is_error = is_extended and bool(bits & CAN_ERR_FLAG)
     return frame(
         time,
-        bits & MAX_ID,
+        bits & MSK_ARBID,
         data,
         length,
         is_extended=is_extended,

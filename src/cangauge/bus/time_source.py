@@ -30,8 +30,8 @@ MICROSECONDS: Final = 1e6
 
 COUNT_EVERY: Final = 64
 """Log times between two REPLAY_COUNT: less than 1 % more frames."""
-STEP_BACK_US: Final = 1_000_000
-"""A larger step back in time [µs] means a clock that was set, or a new log; a smaller one is a
+OUT_OF_ORDER_S: Final = 1.0
+"""A larger step back in time [s] means a clock that was set, or a new log; a smaller one is a
 matter of the order of writing."""
 
 
@@ -43,7 +43,7 @@ def whole_us(time_s: float) -> int:
 class ReceiveTime:
     """Receive stamps.
 
-    After a step back of more than `STEP_BACK_US` time continues from the latest stamp, so that
+    After a step back of more than `OUT_OF_ORDER_S` time continues from the latest stamp, so that
     setting the clock does not stop the estimate. A step forward is a gap.
     """
 
@@ -61,7 +61,7 @@ class ReceiveTime:
         now_us = round(stamp_s * MICROSECONDS) + self._shift_us
         if latest_us is None or now_us >= latest_us:
             self._latest_us = now_us
-        elif latest_us - now_us > STEP_BACK_US:
+        elif latest_us - now_us > OUT_OF_ORDER_S * MICROSECONDS:
             self._shift_us += latest_us - now_us
             now_us = latest_us
             self.steps_back += 1
@@ -150,7 +150,7 @@ def steady_s() -> float:
 
 
 class ReplayClock:
-    """Log time of a replay; a step back of more than `STEP_BACK_US` begins a new log.
+    """Log time of a replay; a step back of more than `OUT_OF_ORDER_S` begins a new log.
 
     `refused` counts clock frames with a wrong CRC or length; `lost` those that did not come, by the
     counts that the replay sends among them.
@@ -175,7 +175,7 @@ class ReplayClock:
             self.refused += 1
             return None
         self._received += 1
-        if self._now_us is not None and now_us < self._now_us - STEP_BACK_US:
+        if self._now_us is not None and now_us < self._now_us - OUT_OF_ORDER_S * MICROSECONDS:
             self.beginnings += 1
         self._now_us = now_us
         return None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar
 
-import numpy as np
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG, MSK_ARBID
 from can.typechecking import CanFilter, StringPathLike
 from cantools.database.can import Message
 
@@ -26,13 +26,12 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
-from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, PollTarget, reply_id, reply_start
 from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest, located, require_temperature
-from cangauge.logs.quantities import convert
+from cangauge.logs.quantities import unit_of
 from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource
 
 _T = TypeVar("_T")
@@ -57,7 +56,7 @@ def pgn_mask(key: int) -> int:
 class VehicleSignal:
     """One signal of a vehicle in A (positive = discharge), V, °C or %, and its message.
 
-    `key` is the arbitration id, plus `EXTENDED` for an extended one.
+    `key` is the arbitration id, plus `CAN_EFF_FLAG` for an extended one.
     """
 
     role: Role
@@ -70,12 +69,12 @@ class VehicleSignal:
     @property
     def arbitration_id(self) -> int:
         """The id without the flag of extended ones."""
-        return self.key & ~EXTENDED
+        return self.key & ~CAN_EFF_FLAG
 
     @property
     def is_extended(self) -> bool:
         """Whether the id has 29 bits."""
-        return bool(self.key & EXTENDED)
+        return bool(self.key & CAN_EFF_FLAG)
 
 
 class MessageProtection(NamedTuple):
@@ -99,8 +98,8 @@ class Vehicle:
     `voltage_accuracy_pct` is the standard deviation of the voltage sensor's lasting error [%].
     `fixed_temperature_c` is the temperature where no signal has it [°C]. `pair_within_s` is the
     largest distance in bus time between paired current and voltage [s]. `messages` has every
-    message with a wanted signal, by key (id, plus `EXTENDED`). `cells` are the cell voltages that
-    `cells_map` states: one signal per cell, or those of one group, numbered in a frame by
+    message with a wanted signal, by key (id, plus `CAN_EFF_FLAG`). `cells` are the cell voltages
+    that `cells_map` states: one signal per cell, or those of one group, numbered in a frame by
     `cell_index`. `remarks` list deviations from the DBC files as written.
     """
 
@@ -196,15 +195,16 @@ class Vehicle:
     def battery(self) -> str:
         """Identity of the battery: messages, bits and sign of current and voltage."""
         parts = []
-        for key, codec in ((each.key, each.codec) for each in (self.current, self.voltage)):
+        for signal in (self.current, self.voltage):
+            codec = signal.codec
             pages = [(field, sorted(values)) for field, values in codec.conditions]
-            sign = codec.gain * codec.factor > 0.0
-            parts.append((key, codec.field, codec.is_signed, codec.float_format, pages, sign))
+            form = codec.field, codec.is_signed, codec.float_format
+            parts.append((signal.key, *form, pages, codec.gain * codec.factor > 0.0))
         return repr(parts)
 
     @property
     def frame_keys(self) -> tuple[int, ...]:
-        """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
+        """Ids of the frames with a wanted signal, plus `CAN_EFF_FLAG`, each once."""
         keys = [signal.key for signal in (*self.signals, *self.cells)]
         ids = (reply_id(key) if self.messages[key].reply else key for key in keys)
         return tuple(dict.fromkeys(ids))
@@ -212,7 +212,7 @@ class Vehicle:
     @property
     def wanted_ids(self) -> tuple[int, ...]:
         """Arbitration ids with a wanted signal, each once."""
-        return tuple(dict.fromkeys(key & ~EXTENDED for key in self.frame_keys))
+        return tuple(dict.fromkeys(key & ~CAN_EFF_FLAG for key in self.frame_keys))
 
     @property
     def poll_targets(self) -> list[PollTarget]:
@@ -228,11 +228,11 @@ class Vehicle:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
         filters: list[CanFilter] = []
         for key in self.frame_keys:
-            is_extended = bool(key & EXTENDED)
-            mask = 0x1FFFFFFF if is_extended else 0x7FF
+            number, is_extended = key & MSK_ARBID, bool(key & CAN_EFF_FLAG)
+            mask = MSK_ARBID if is_extended else 0x7FF
             if key in self.messages and self.messages[key].by_pgn:
                 mask = pgn_mask(key)
-            filters.append({"can_id": key & ~EXTENDED, "can_mask": mask, "extended": is_extended})
+            filters.append({"can_id": number, "can_mask": mask, "extended": is_extended})
         return filters
 
 
@@ -262,9 +262,10 @@ class _Binder:
         if not 0.0 <= within_s <= 1.0:
             raise InputError("must be within 0–1 s", field="pair_within_s", value=within_s)
         temperature, fixed_c = mapping.temperature, temperature_c
-        cells = self._cells(mapping.cells)
         if temperature is not None and fixed_c is None:
             fixed_c = temperature.fixed_c
+        wanted_cells = [] if mapping.cells is None else mapping.cells.signal_maps()
+        cells = tuple(self._signal("cells", each) for each in wanted_cells)
         return Vehicle(
             name=mapping.name,
             current=self._signal("current", mapping.current),
@@ -282,10 +283,6 @@ class _Binder:
             dbc_files=tuple(str(path) for _, path in self._databases),
             remarks=tuple(self._remarks),
         )
-
-    def _cells(self, wanted: CellsMap | None) -> tuple[VehicleSignal, ...]:
-        maps = [] if wanted is None else wanted.signal_maps()
-        return tuple(self._signal("cells", each) for each in maps)
 
     def _cell_index(
         self, wanted: CellsMap | None, cells: Sequence[VehicleSignal]
@@ -341,20 +338,15 @@ class _Binder:
 
     def _unit(self, role: Role, codec: SignalCodec) -> tuple[float, float]:
         """Return factor and offset from the DBC's unit to the canonical one."""
-        column, source = LOG_COLUMNS[role], self._source
-        try:
-            ends = convert(
-                np.array([0.0, 1.0]), column, codec.unit, source=source, label=codec.name
-            )
-        except InputError as error:
+        column = LOG_COLUMNS[role]
+        scale = unit_of(column, codec.unit) if codec.unit.strip() else (1.0, 0.0)
+        if scale is None:
             problem = f"the unit of {codec.name} in the DBC is unknown for {column}"
             cure = "name another signal, or state scale and offset in the map file"
             cure += " (scale = 1 takes the values as they are)"
-            where = f"{role}.signal"
-            raise InputError(
-                problem, source=source, field=where, value=codec.unit, cure=cure
-            ) from error
-        return float(ends[1] - ends[0]), float(ends[0])
+            where, unit = f"{role}.signal", codec.unit
+            raise InputError(problem, source=self._source, field=where, value=unit, cure=cure)
+        return scale
 
     def _protections(self) -> dict[int, MessageProtection]:
         """Return protection and period of the messages with a signal."""
@@ -371,27 +363,29 @@ class _Binder:
                 period_s = cycle_ms / 1000.0
             with located(self._source, f"messages.{message.name}"):
                 rule = each.rule(message, self._mapping.rules)
-                self._refuse_kind(message, each)
-            is_reply = each.isotp or each.uds
-            reply = reply_start(message.frame_id, each.uds) if is_reply else b""
+                reply = self._reply_of(message, each)
             protections[key] = MessageProtection(rule, period_s, reply, each.j1939, each.request_id)
         return protections
 
     @staticmethod
-    def _refuse_kind(message: Message, stated: MessageMap) -> None:
-        """Raise InputError if the message's id cannot be what the map says of it."""
-        number = message.frame_id
-        for kind, example in _EXTENDED_KINDS.items():
-            if getattr(stated, kind) and not message.is_extended_frame:
-                problem = f"{kind} needs an extended id"
-                cure = f"give it that number in the DBC, as {example}"
-                raise InputError(problem, field=kind, value=f"0x{number:X}", cure=cure)
-        if stated.isotp and not stated.uds and number >> 8 & 0xFF == READ_BY_IDENTIFIER:
-            sender = f"0x{reply_id(number):X}"
+    def _reply_of(message: Message, stated: MessageMap) -> bytes:
+        """Return the first bytes of a reply over ISO-TP; b"" for another message.
+
+        Raises InputError if the message's id cannot be what the map says of it.
+        """
+        number, problem, cure = message.frame_id, "", ""
+        field = next((kind for kind in _EXTENDED_KINDS if getattr(stated, kind)), "")
+        if field and not message.is_extended_frame:
+            problem = f"{field} needs an extended id"
+            cure = f"give it that number in the DBC, as {_EXTENDED_KINDS[field]}"
+        elif stated.isotp and not stated.uds and number >> 8 & 0xFF == READ_BY_IDENTIFIER:
+            field, sender = "isotp", f"0x{reply_id(number):X}"
             problem = "replies that begin with 62 differ in two further bytes"
             cure = f"state uds = true, and number it {sender} and both bytes: {sender}0101 for"
             cure += " 62 01 01"
-            raise InputError(problem, field="isotp", value=f"0x{number:X}", cure=cure)
+        if problem:
+            raise InputError(problem, field=field, value=f"0x{number:X}", cure=cure)
+        return reply_start(number, stated.uds) if stated.isotp or stated.uds else b""
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""
@@ -400,7 +394,7 @@ class _Binder:
 
 
 def _key(message: Message) -> int:
-    return message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+    return message.frame_id | (CAN_EFF_FLAG if message.is_extended_frame else 0)
 
 
 # --- Presets

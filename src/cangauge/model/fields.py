@@ -31,7 +31,7 @@ Knots = Annotated[tuple[Soc, ...], Field(min_length=2), AfterValidator(increasin
 
 
 class Fields(BaseModel):  # noqa: PLW1641 (frozen: pydantic gives its hash)
-    """Part of a model file: no further fields, no change, no infinite number."""
+    """Part of a model file or a map file: no further fields, no change, no infinite number."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -32,8 +32,6 @@ from cangauge.settings import FrameIds
 
 _LOG = logging.getLogger(__name__)
 
-AHEAD_S: Final = 0.0002
-"""Frames due within this time are sent at once: sleeping is less precise [s]."""
 WINDOW_FRAMES: Final = 160
 """Most frames in flight: a default socket buffer of Linux holds about 270."""
 LOST_AFTER_S: Final = 1.0
@@ -167,7 +165,7 @@ class Pacer:
             self._origin = (time_us, time.monotonic())
         first_us, first_s = self._origin
         due_s = first_s + (time_us - first_us) / self._us_per_s
-        while (ahead_s := due_s - time.monotonic()) > AHEAD_S and not self._stop():
+        while (ahead_s := due_s - time.monotonic()) > 0.0 and not self._stop():
             self._rest(min(ahead_s, POLL_S))
 
 

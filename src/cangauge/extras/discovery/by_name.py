@@ -19,11 +19,11 @@ from typing import Final
 
 import can
 import numpy as np
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG
 from cantools.database.can import Database, Message, Signal
 
 from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec, signal_codec
-from cangauge.bus.dbc_text import EXTENDED
 from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate
 from cangauge.extras.discovery.fields import LEAST_BITS
@@ -254,14 +254,14 @@ def named_signals(
         If no message of the DBC is in the capture.
     """
     of_dbc = {
-        message.frame_id | (EXTENDED if message.is_extended_frame else 0): message
+        message.frame_id | (CAN_EFF_FLAG if message.is_extended_frame else 0): message
         for message in database.messages
     }
     frames: defaultdict[int, _NamedFrames] = defaultdict(_NamedFrames)
     is_capture = False
     for each in messages:
         is_capture = True
-        key = each.arbitration_id | (EXTENDED if each.is_extended_id else 0)
+        key = each.arbitration_id | (CAN_EFF_FLAG if each.is_extended_id else 0)
         if key in of_dbc and not each.is_error_frame and not each.is_remote_frame:
             frames[key].add(each)
     if is_capture and not frames:

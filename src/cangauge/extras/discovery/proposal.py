@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG
+
 from cangauge._text import printable
-from cangauge.bus.dbc_text import EXTENDED
 from cangauge.bus.vehicle import PRESETS
 from cangauge.extras.discovery.candidate import ROLES, Candidate, Level, short_name
 
@@ -242,7 +243,7 @@ def _dbc_text(chosen: Sequence[Candidate]) -> str:
         of, place = each.stream, each.place
         if of is None or place is None:
             continue
-        key = of.arbitration_id | (EXTENDED if of.is_extended else 0)
+        key = of.arbitration_id | (CAN_EFF_FLAG if of.is_extended else 0)
         head = f"BO_ {key} {each.message}: {of.length} Vehicle"
         mark = ""
         if (selector := of.selector) is not None:

@@ -15,9 +15,10 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import can
+from can.interfaces.socketcan.constants import CAN_ERR_FLAG, MSK_ARBID
 from can.io.generic import BinaryIOMessageReader
 
-from cangauge.bus.readers import ERROR_FLAG, MAX_ID, CaptureReader
+from cangauge.bus.readers import CaptureReader
 from cangauge.errors import InputError
 
 _CAN, _SLL, _SLL2 = 227, 113, 276
@@ -177,10 +178,10 @@ class PcapReader(CaptureReader, BinaryIOMessageReader):
             self.skip(None)
             return None
         return can.Message(
-            arbitration_id=number & MAX_ID,
+            arbitration_id=number & MSK_ARBID,
             is_extended_id=bool(number & _EXTENDED),
             is_remote_frame=is_remote,
-            is_error_frame=bool(number & ERROR_FLAG),
+            is_error_frame=bool(number & CAN_ERR_FLAG),
             is_fd=is_fd,
             bitrate_switch=is_fd and bool(flags & _BRS),
             error_state_indicator=is_fd and bool(flags & _ESI),
