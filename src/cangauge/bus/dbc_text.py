@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from can.interfaces.socketcan.constants import CAN_EFF_FLAG
+from can.interfaces.socketcan.constants import CAN_EFF_FLAG, MAX_11_BIT_ID, MSK_ARBID
 
 from cangauge.errors import InputError
 
@@ -33,7 +33,10 @@ _LENGTH: Final = re.compile(r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)")
 _BITS: Final = re.compile(r"(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@")
 """Start bit and length of a signal."""
 _ID: Final = re.compile(
-    r"\b(?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|SIG_GROUP_|BO_TX_BU_)\s++(\d{4,10})\b"
+    rf"{_QUOTED.pattern}"
+    r"|(?P<keyword>\b(?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|SIG_GROUP_|BO_TX_BU_)\s++)"
+    r"(?P<id>\d{4,10})\b",
+    re.DOTALL,
 )
 _DEFINED: Final = re.compile(
     r"\bBO_\s++(?P<id>\d++)\s++(?P<message>\w++)\s*+:"
@@ -53,10 +56,9 @@ def prepared(text: str, path: Path) -> tuple[str, list[str]]:
     remarks = []
     bare = _without_content(text)
     _refuse_numbers(bare, path)
-    unflagged = [each for each in _ID.finditer(bare) if 0x7FF < int(each[1]) < 0x20000000]
-    if unflagged:
-        text = _with_flags(text, unflagged)
-        bare = _without_content(text)
+    flagged = _ID.sub(_with_flag, text)
+    if flagged != text:
+        text, bare = flagged, _without_content(flagged)
         remarks.append("ids of more than 11 bits are taken as extended")
     messages = _outline(bare)
     gone = []
@@ -86,12 +88,12 @@ def _blank(quoted: re.Match[str]) -> str:
     return '"' + " " * (len(quoted[0]) - 2) + '"'
 
 
-def _with_flags(text: str, ids: list[re.Match[str]]) -> str:
-    parts, place = [], 0
-    for match in ids:
-        parts += [text[place : match.start(1)], str(int(match[1]) | CAN_EFF_FLAG)]
-        place = match.end(1)
-    return "".join([*parts, text[place:]])
+def _with_flag(match: re.Match[str]) -> str:
+    """Return an id of more than 11 bits with the flag of extended ones; another match unchanged."""
+    number = int(match["id"] or 0)
+    if not MAX_11_BIT_ID < number <= MSK_ARBID:
+        return match[0]
+    return f"{match['keyword']}{number | CAN_EFF_FLAG}"
 
 
 def _refuse_numbers(bare: str, path: Path) -> None:

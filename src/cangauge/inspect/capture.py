@@ -239,10 +239,19 @@ class _Frames:
             rule, length = stated
             payloads = [data[:length] for data in payloads]
             return _counts_by(rule, _name_of(rule), payloads, self.stamps_s, period_s)
-        if len(set(map(bytes, payloads))) < PAYLOADS:
-            return {}
-        tried = (_by_rule(each, payloads, self.stamps_s, period_s) for each in ("leaf", "generic"))
-        return next(filter(None, tried), {})
+        varies = len(set(map(bytes, payloads))) >= PAYLOADS
+        for name in ("leaf", "generic") if varies else ():
+            rule, first = RULES[name], payloads[:LEARN_FRAMES]
+            if 2 * sum(map(rule.is_whole, first)) < len(first):
+                continue
+            found = _counts_by(rule, name, payloads, self.stamps_s, period_s)
+            if found["crc_errors"] > DAMAGED * len(payloads):
+                continue
+            most = MIXED_SHARE if found["two_senders"] else REPEATED_SHARE
+            if found["counter_repeats"] > most * len(payloads):
+                return {"protection": name, "crc_errors": found["crc_errors"]}
+            return found
+        return {}
 
 
 def _name_of(rule: Protection) -> str:
@@ -250,22 +259,6 @@ def _name_of(rule: Protection) -> str:
         return rule.name
     known = (name for name, each in RULES.items() if each == rule)
     return next(known, COUNTER if isinstance(rule, CounterRule) else "own rule")
-
-
-def _by_rule(
-    name: str, payloads: list[bytearray], stamps_s: array[float], period_s: float | None
-) -> dict[str, Any]:
-    """Return the fields of `IdSummary` by a rule; none where its CRCs do not agree."""
-    rule, first = RULES[name], payloads[:LEARN_FRAMES]
-    if 2 * sum(map(rule.is_whole, first)) < len(first):
-        return {}
-    found = _counts_by(rule, name, payloads, stamps_s, period_s)
-    if found["crc_errors"] > DAMAGED * len(payloads):
-        return {}
-    most = MIXED_SHARE if found["two_senders"] else REPEATED_SHARE
-    if found["counter_repeats"] > most * len(payloads):
-        return {"protection": name, "crc_errors": found["crc_errors"]}
-    return found
 
 
 def _counts_by(

@@ -20,11 +20,7 @@ import can
 
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.publish import (
-    ACKNOWLEDGE_EVERY,
-    SAMPLES_MODULO,
-    SocReader,
-)
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, SAMPLES_MODULO, SocReader
 from cangauge.bus.time_source import COUNT_EVERY, MICROSECONDS, clock_frame, count_frame
 from cangauge.errors import CangaugeError, InputError
 from cangauge.replay.steps import Source, Step
@@ -192,10 +188,8 @@ class _Player:
         self.in_flight: deque[int] = deque()
         """Frames of each sample sent that is neither acknowledged nor lost."""
         self._incomplete = 0  # frames sent since the latest sample
-        self._lost = 0
-        self.state = ReplayState()
-        if self.is_max:
-            self.state.acknowledged = self.state.lost = 0
+        known = 0 if self.is_max else None
+        self.state = ReplayState(acknowledged=known, lost=known)
 
     def send(self, step: Step) -> None:
         """Send a step when it is due, or when the receiver has room."""
@@ -279,7 +273,7 @@ class _Player:
             if state.acknowledged != before:
                 before, last_s = state.acknowledged, now_s
             elif state.acknowledged and self._reported_s - last_s > LOST_AFTER_S:
-                state.lost = self._lost = self._lost + len(self.in_flight)
+                state.lost = (state.lost or 0) + len(self.in_flight)
                 self.in_flight.clear()
                 self._incomplete = 0
                 text = f"{state.lost} samples lost so far; the replay continues"
@@ -309,14 +303,13 @@ class _Player:
         if before is None or not self.state.samples:
             return
         more, state, sent = (count - before) % SAMPLES_MODULO, self.state, len(self.in_flight)
-        late = max(more - sent, 0)  # counted as lost, but only slow
-        if late > self._lost:
+        late, lost = max(more - sent, 0), state.lost or 0  # late: counted as lost, but only slow
+        if late > lost:
             raise self._error(
-                f"the receiver has processed {more} samples where {sent + self._lost} were in"
-                " flight: it was restarted, or another program sends or acknowledges on this bus"
-                " too"
+                f"the receiver has processed {more} samples where {sent + lost} were in flight: it"
+                " was restarted, or another program sends or acknowledges on this bus too"
             )
-        state.lost = self._lost = self._lost - late
+        state.lost = lost - late
         state.acknowledged = (state.acknowledged or 0) + more
         for _ in range(more - late):
             self.in_flight.popleft()
