@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from cangauge._text import counted, duration, rounded, significant, uncertain
+from cangauge._typing import BoolArray, FloatArray
+from cangauge.bus.plausibility import (
+    LEAST_SWING,
+    STUCK_AFTER_S,
+    SWING_C_RATE,
+    PackProperties,
+    stuck_detectors,
+)
 from cangauge.errors import InputError
 from cangauge.identify.rows import (
     LEAST_ROWS,
@@ -18,10 +26,10 @@ from cangauge.identify.rows import (
     usable_delays,
     usable_rows,
 )
-from cangauge.inspect.channels import Channel, describe_channels
 from cangauge.logs.charge import MIN_SPAN_PCT, contradiction, implied_capacity
 from cangauge.logs.gaps import discharged_ah, uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
+from cangauge.logs.resolution import quantum_of
 from cangauge.logs.sign import (
     STEP_SPACING_S,
     SignFinding,
@@ -50,11 +58,34 @@ REST_S: Final = 300.0
 """Shortest rest that shows the rest voltage [s]."""
 WIDE_SOC_PCT: Final = 60.0
 """Span of SoC that shows most of the voltage curve [%]."""
+CURRENT_SHARE: Final = 0.05
+"""Smallest swing of current that must move the voltage, of its range [-]."""
+VOLTAGE_SHARE: Final = 0.002
+"""Smallest swing of voltage that must move the current, relative to its median [-]."""
 SINGLE_ROW: Final = "too short: a single row, and charge is counted from one row to the next"
 
 
 Gap = dict[str, float]
 """Time without rows: time of the last row before it, and its length [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One channel of a log; values in `unit`.
+
+    `quantum` is the quantization step (None: there is none), `levels` the number of distinct
+    values, `missing` the rows without one. `stuck` are the intervals in which the channel kept one
+    value while the other one swung: start and length [s], value, and why.
+    """
+
+    unit: str
+    minimum: float
+    maximum: float
+    median: float
+    quantum: float | None
+    levels: int
+    missing: int
+    stuck: tuple[dict[str, Any], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +204,7 @@ def inspect_log(log: Log) -> LogInspection:
     soc = _soc(log, sign, contradicts)
     charge = _charge(log, timing.gap_limit_s)
     resistance = _resistance(log, sign)
-    channels = describe_channels(log, resistance["median_ohm"] if resistance else None)
+    channels = _channels(log, resistance["median_ohm"] if resistance else None)
     warnings = tuple(_warnings(log, timing, channels, charge, sign))
     abilities: dict[str, tuple[Verdict, str]] = {
         "sign of current": ("yes" if sign.sign else "no", sign.sentence),
@@ -280,6 +311,76 @@ def _resistance(log: Log, sign: SignFinding) -> dict[str, float] | None:
         return None
     found = dict(zip(("median_ohm", "lower_ohm", "upper_ohm"), ohm, strict=True))
     return {**found, "steps": current.size}
+
+
+# --- Channels
+
+
+_UNITS: Final = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}
+
+
+def _channels(log: Log, resistance_ohm: float | None) -> dict[str, Channel]:
+    """Describe the channels of a log.
+
+    With a resistance [Ω], current and voltage are searched for stuck intervals.
+    """
+    columns = {name: getattr(log, name) for name in _UNITS}
+    channels = {
+        name: _channel(values, _UNITS[name])
+        for name, values in columns.items()
+        if values is not None and np.isfinite(values).any()
+    }
+    if resistance_ohm:
+        stuck = _stuck(log, channels["current_a"], channels["voltage_v"], abs(resistance_ohm))
+        channels |= {name: replace(channels[name], stuck=found) for name, found in stuck.items()}
+    return channels
+
+
+def _channel(values: FloatArray, unit: str) -> Channel:
+    finite = values[np.isfinite(values)]
+    low, high, median = float(finite.min()), float(finite.max()), float(np.median(finite))
+    levels, missing = int(np.unique(finite).size), int(values.size - finite.size)
+    return Channel(unit, low, high, median, quantum_of(finite), levels, missing)
+
+
+def _stuck(
+    log: Log, current: Channel, voltage: Channel, resistance_ohm: float
+) -> dict[str, tuple[dict[str, Any], ...]]:
+    """Return the stuck intervals of current and voltage, by the detectors of the service."""
+    pack = PackProperties(
+        resistance_ohm,
+        error_std_v=VOLTAGE_SHARE * abs(voltage.median) / LEAST_SWING,
+        capacity_ah=CURRENT_SHARE * (current.maximum - current.minimum) / SWING_C_RATE,
+        usual_v=abs(voltage.median),
+    )
+    of_current, of_voltage = stuck_detectors(
+        pack, (current.quantum or 0.0, STUCK_AFTER_S), (voltage.quantum or 0.0, STUCK_AFTER_S)
+    )
+    columns = (each.tolist() for each in (log.time_s, log.current_a, log.voltage_v))
+    flags = [
+        (of_current.update(current_a, time_s), of_voltage.update(voltage_v, time_s))
+        for time_s, current_a, voltage_v in zip(*columns, strict=True)
+    ]
+    is_stuck_a, is_stuck_v = np.transpose(flags)
+    why_a = f"the voltage swung several times by {of_voltage.swing:.3g} V or more"
+    why_v = f"the current swung several times by {of_current.swing:.3g} A or more"
+    return {
+        "current_a": _intervals(log.time_s, log.current_a, is_stuck_a, why_a),
+        "voltage_v": _intervals(log.time_s, log.voltage_v, is_stuck_v, why_v),
+    }
+
+
+def _intervals(
+    time_s: FloatArray, values: FloatArray, is_stuck: BoolArray, why: str
+) -> tuple[dict[str, Any], ...]:
+    """Return the intervals of one value that have a row recognised as stuck."""
+    first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    last = np.append(first[1:], values.size) - 1
+    hit = np.logical_or.reduceat(is_stuck, first)
+    names = ("start_s", "duration_s", "value")
+    start_s = time_s[first[hit]]
+    rows = np.column_stack([start_s, time_s[last[hit]] - start_s, values[first[hit]]]).tolist()
+    return tuple({**dict(zip(names, row, strict=True)), "why": why} for row in rows)
 
 
 # --- Warnings
