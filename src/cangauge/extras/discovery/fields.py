@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter, itemgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import can
 import numpy as np
@@ -30,8 +30,6 @@ MIN_FRAMES: Final = 12
 """Fewest frames of an id that can show how its bits move."""
 MULTIPLEXED: Final = 0.4
 """Largest ratio of the changes among frames of one multiplexer value to those of all frames."""
-LINK_EVENTS: Final = 4
-"""Fewest carries from which a cut is judged."""
 NATURAL: Final = -2.0
 """Least log prior of a field whose numbers are looked at [nats]."""
 
@@ -86,12 +84,18 @@ class Stream:
 
 @dataclass(frozen=True)
 class Place:
-    """Bits of a field: reading order, first and last position, sign."""
+    """Bits of a field: reading order, first and last position, sign.
+
+    `constant` is what constant bits among them add to the number of those that toggle, `nature` the
+    log prior that all are a measured number [nats].
+    """
 
     is_motorola: bool
     first: int
     last: int
-    is_signed: bool
+    is_signed: bool = False
+    constant: int = 0
+    nature: float = 0.0
 
     @property
     def width(self) -> int:
@@ -115,18 +119,6 @@ class Place:
         return frozenset(places if self.is_motorola else (_turned(each, length) for each in places))
 
 
-class Extent(NamedTuple):
-    """A field together with constant bits above it.
-
-    `nature` is the log prior that these bits are a measured number [nats], `constant` what the
-    constant bits add to it.
-    """
-
-    place: Place
-    nature: float
-    constant: int
-
-
 @dataclass(eq=False)
 class Field:
     """A number in the frames of a stream.
@@ -138,18 +130,19 @@ class Field:
         By frame, of the bits that toggle.
     missing : array (n,) of bool
         Frames with a code for "not available".
-    extents : list of Extent
+    places : list of Place
+        It together with constant bits above it.
     """
 
     stream: Stream
     raw: Ints
     missing: BoolArray
-    extents: list[Extent]
+    places: list[Place]
 
     @property
-    def best(self) -> Extent:
+    def best(self) -> Place:
         """The likeliest reading."""
-        return max(self.extents, key=attrgetter("nature"))
+        return max(self.places, key=attrgetter("nature"))
 
     @cached_property
     def values(self) -> Ints:
@@ -238,7 +231,7 @@ def _demultiplexed(stream: Stream) -> list[Stream]:
             stream,
             time_s=stream.time_s[codes == value],
             payload=stream.payload[codes == value],
-            selector=Place(True, first, first + width - 1, False),
+            selector=Place(True, first, first + width - 1),
             selected=value,
         )
         for value in np.unique(codes).tolist()
@@ -310,7 +303,7 @@ def _links(bits: NDArray[np.uint8], flips: NDArray[np.int64]) -> tuple[BoolArray
         step = np.diff(_codes(bits, top, cut + 1 - top)) % above
         change = np.diff(_codes(bits, cut + 1, below.shape[1])) / float(1 << below.shape[1])
         carries = np.concatenate([-change[step == 1], change[step == above - 1]])
-        if len(carries) >= LINK_EVENTS:
+        if len(carries) >= 4:
             still = change[(step == 0) & (change != 0.0)]
             error = 2.0 * (carries.std() / np.sqrt(len(carries)) + 0.3 / len(carries))
             movement = float(np.abs(still).mean()) if len(still) else 1.0
@@ -324,7 +317,7 @@ def _together(moved: BoolArray) -> BoolArray:
     flips = moved.sum(0)
     shared = (moved[:, :-1] & moved[:, 1:]).sum(0)
     often = flips[1:] > 0.5 * len(moved)
-    found = (flips[:-1] >= LINK_EVENTS - 1) & (shared >= 0.9 * flips[:-1]) & ~often
+    found = (flips[:-1] >= 3) & (shared >= 0.9 * flips[:-1]) & ~often
     return np.append(found, False)
 
 
@@ -388,15 +381,15 @@ def fields_of(streams: Sequence[Stream]) -> list[Field]:
         _LOG.debug("id %d of %d: %s", number, len(streams), stream.name)
         found: dict[bytes, Field] = {}
         for order, other in (pair, pair[::-1]):
-            for extents in _extents(order, other, min(odds if order.is_motorola else -odds, 0.0)):
+            for places in _places(order, other, min(odds if order.is_motorola else -odds, 0.0)):
                 for is_signed in (False, True):
-                    made = _number(stream, order, extents, is_signed=is_signed)
+                    made = _number(stream, order, places, is_signed=is_signed)
                     if made is not None:
                         kept = found.setdefault(made.raw.tobytes(), made)
                         if kept is not made:
                             if made.best.nature > kept.best.nature:
                                 kept.missing = made.missing
-                            kept.extents += made.extents
+                            kept.places += made.places
         fields += found.values()
     return fields
 
@@ -415,7 +408,7 @@ def _byte_order(orders: Iterable[Sequence[_Order]]) -> float:
     return max(-3.0, min(3.0, odds))  # modules of several suppliers share a bus
 
 
-def _extents(order: _Order, other: _Order, odds: float) -> Iterator[tuple[int, list[Extent]]]:
+def _places(order: _Order, other: _Order, odds: float) -> Iterator[tuple[int, list[Place]]]:
     """Yield the first toggling bit of plausible fields, with what may stand above them."""
     toggles = np.flatnonzero((order.flips > 0) & ~order.dead)
     dead_before = np.concatenate([[0], np.cumsum(order.dead)])
@@ -435,8 +428,7 @@ def _extents(order: _Order, other: _Order, odds: float) -> Iterator[tuple[int, l
                     nature = body + _ends(order, other, top, last)
                     nature += odds if top // 8 != last // 8 else 0.0
                     if nature > NATURAL:
-                        place = Place(order.is_motorola, top, last, is_signed=False)
-                        found.append(Extent(place, nature, constant))
+                        found.append(Place(order.is_motorola, top, last, False, constant, nature))
                 top -= 1
             if found:
                 yield first, found
@@ -491,22 +483,21 @@ def _ends(  # noqa: C901 - one rule after the other
 
 
 def _number(
-    stream: Stream, order: _Order, found: tuple[int, list[Extent]], *, is_signed: bool
+    stream: Stream, order: _Order, found: tuple[int, list[Place]], *, is_signed: bool
 ) -> Field | None:
     """Return the numbers of a field; None for noise over its whole range."""
-    first, extents = found
-    last = extents[0].place.last
+    first, places = found
+    narrowest, widest = places[0], places[-1]
+    last = widest.last
     raw = order.codes(first, last)
     if is_signed:
-        if extents[0].place.first != first:
+        if narrowest.first != first:
             return None
         half = 1 << last - first
         raw = np.where(raw >= half, raw - 2 * half, raw).astype(np.int32)
         missing = (raw == half - 1) | (raw == -half)
-        place = Place(order.is_motorola, first, last, is_signed=True)
-        extents = [extents[0]._replace(place=place)]
+        places = [replace(narrowest, is_signed=True)]
     else:
-        widest = extents[-1].place
         missing = order.codes(widest.first, last) == (1 << widest.width) - 1
     if missing.mean() > 0.5:
         return None
@@ -514,6 +505,6 @@ def _number(
     reach = good.max() - good.min()
     if reach == 0.0:
         return None
-    made = Field(stream, raw, missing, extents)
+    made = Field(stream, raw, missing, places)
     roughness = float((np.diff(good) ** 2).mean() / (2.0 * good.var()))
-    return None if roughness > 0.35 and 2.0 * reach > (1 << made.best.place.width) - 1 else made
+    return None if roughness > 0.35 and 2.0 * reach > (1 << made.best.width) - 1 else made

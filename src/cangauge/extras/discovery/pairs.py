@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.discovery.candidate import MOST_A, ROLES, SHOWN, Candidate, Level
-from cangauge.extras.discovery.fields import Extent, Field, Ints, Stream, most_common
+from cangauge.extras.discovery.fields import Field, Ints, Place, Stream, most_common
 
 CURRENT_SCALES: Final = {
     0.1: 0.0,
@@ -89,7 +89,7 @@ class Row:
     Parameters
     ----------
     field : Field
-    extent : Extent
+    place : Place
         Which of its bits it has.
     missing : array (n,) of bool
     prior : float
@@ -100,7 +100,7 @@ class Row:
     """
 
     field: Field
-    extent: Extent
+    place: Place
     missing: BoolArray
     prior: float
     levels: tuple[Level, ...] = ()
@@ -108,11 +108,11 @@ class Row:
     @cached_property
     def values(self) -> Ints:
         """Raw numbers by frame."""
-        return self.field.raw[~self.missing] + self.extent.constant
+        return self.field.raw[~self.missing] + self.place.constant
 
     def means_on(self, grid: Grid) -> FloatArray:
         """Return the means of the raw numbers by slot of time."""
-        return grid.means(self.field.stream, self.field.raw + self.extent.constant, self.missing)
+        return grid.means(self.field.stream, self.field.raw + self.place.constant, self.missing)
 
     @cached_property
     def away(self) -> float:
@@ -144,18 +144,18 @@ class Row:
     @cached_property
     def bits(self) -> frozenset[tuple[int, bool, int]]:
         """Its bits, each with its id: a gateway repeats frames on other buses."""
-        return self.field.stream.bits(self.extent.place)
+        return self.field.stream.bits(self.place)
 
     @property
     def name(self) -> str:
         """Id and bits as in a DBC, such as "0x1DB 7|11@0-"."""
         of = self.field.stream
-        name = f"{of.name} {self.extent.place.text(of.length)}"
+        name = f"{of.name} {self.place.text(of.length)}"
         return name if of.selector is None else f"{name} m{of.selected}"
 
     def candidate(self, role: str, scale: float, offset: float, **more: Any) -> Candidate:
         """Return the field as the signal of a role."""
-        stream, place = self.field.stream, self.extent.place
+        stream, place = self.field.stream, self.place
         ends = scale * np.array([self.values.min(), self.values.max()], np.float64) + offset
         gone = self.field.raw[self.field.missing & (self.field.raw != 0)]
         codes, counts = np.unique(gone, return_counts=True)
@@ -320,7 +320,7 @@ def _scales(
     Where the slope is not known it is chance, and constrains neither.
     """
     volts = np.array([row.levels[0].scale for row in u.rows])[:, None]
-    full = 2.0 ** (np.array([row.extent.place.width for row in i.rows]) - 1)
+    full = 2.0 ** (np.array([row.place.width for row in i.rows]) - 1)
     away = np.array([row.away for row in i.rows])
     likely, best = np.full(slope.shape, IMPOSSIBLE), np.ones(slope.shape)
     for amps, usual in CURRENT_SCALES.items():
@@ -421,7 +421,7 @@ def _halves(u: _Moves, i: _Moves, a: int, b: int) -> list[float]:
 
 def _zero(current: Row) -> float:
     """Return the raw number of a current that means none: the round one where it rests."""
-    values, place = current.values, current.extent.place
+    values, place = current.values, current.place
     if place.is_signed:
         return 0.0
     zeros = np.array(round_zeros(float(values.min()), float(values.max()), place.width) or [0.0])

@@ -26,7 +26,7 @@ from cangauge.extras.discovery.candidate import (
     Level,
     is_capacity,
 )
-from cangauge.extras.discovery.fields import Extent, Field, collect, fields_of
+from cangauge.extras.discovery.fields import Field, collect, fields_of
 from cangauge.extras.discovery.pairs import (
     IMPOSSIBLE,
     LARGEST_R2,
@@ -170,46 +170,47 @@ def _socs(
 
 def _as_current(field: Field) -> Row | None:
     """Return a field as a current; None where it has too few values."""
-    place, nature, constant = field.best
-    prior = nature + field.prior
+    place, full = field.best, 1 << field.best.width
+    prior = place.nature + field.prior
     if not place.is_signed:
         if len(np.unique(field.values)) < 3:
             return None
-        low, high = (float(end + constant) for end in (field.values.min(), field.values.max()))
-        if low >= 0.9 * (1 << place.width):  # nearly all ones: a small negative number
-            place, constant = replace(place, is_signed=True), constant - (1 << place.width)
+        low = float(field.values.min() + place.constant)
+        high = float(field.values.max() + place.constant)
+        if low >= 0.9 * full:  # nearly all ones: a small negative number
+            place = replace(place, is_signed=True, constant=place.constant - full)
         elif not any(round_zeros(low, high, place.width)):
             # A pack's current has two signs: an unsigned field holds zero as a round number.
             prior -= 5.0
-    return Row(field, Extent(place, nature, constant), field.missing, prior)
+    return Row(field, place, field.missing, prior)
 
 
 def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
     """Return the likeliest reading and scale of a field as a pack's voltage."""
-    if field.best.place.is_signed:
+    if field.best.is_signed:
         return None
     zero = (field.raw == 0) & ~field.missing
     readings: list[Row] = []
-    for extent in field.extents:
+    for place in field.places:
         # Zero: before the contactors close.
-        missing = field.missing | zero if extent.constant == 0 else field.missing
+        missing = field.missing | zero if place.constant == 0 else field.missing
         good = field.raw[~missing]
         if len(good) < 0.3 * len(field.raw):
             continue
-        low, level, high = np.percentile(good, [2.0, 50.0, 98.0]) + extent.constant
+        low, level, high = np.percentile(good, [2.0, 50.0, 98.0]) + place.constant
         if low <= 0.0 or high - low > 0.5 * level:
             continue
         # What rests at half its range is a torque, a yaw rate or the like with an offset; a voltage
         # is there by chance once in twenty or thirty.
-        width = extent.place.width
+        width = place.width
         at_half = abs(level / (1 << (width - 1)) - 1.0) < 0.03
-        prior = extent.nature + field.prior - 3.0 * at_half
+        prior = place.nature + field.prior - 3.0 * at_half
         for scale in VOLTAGE_SCALES:
             volts = level * scale
             text = f"{volts:.3g} V at {scale:g} V a step of {width} bits"
             text += f" (about {round(volts / 3.7)} cells)"
             likely = prior + _scale_prior(scale, volts, width, nominal_v)
-            readings.append(Row(field, extent, missing, likely, (Level(scale, volts, text),)))
+            readings.append(Row(field, place, missing, likely, (Level(scale, volts, text),)))
     return _likeliest(readings, by_scale=nominal_v is None)
 
 
@@ -229,7 +230,7 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
         for each in readings
         if each.prior > least
         and abs(each.levels[0].value / own.value - 1.0) > 0.01
-        and (each.extent is best.extent or not by_scale)
+        and (each.place is best.place or not by_scale)
     ]
     best.levels = (own, *sorted(others))
     return best
@@ -240,7 +241,7 @@ def _as_charge(
 ) -> Candidate | None:
     """Return a field as a SoC, if it falls as the charge is drawn in a span of the grid."""
     distinct = len(np.unique(field.values))
-    if field.best.place.is_signed or distinct < 4:
+    if field.best.is_signed or distinct < 4:
         return None
     values = grid.means(field.stream, field.raw, field.missing)[span]
     spread, moved = float(np.std(values)), float(np.std(drawn_ah))
@@ -253,16 +254,16 @@ def _as_charge(
         return None
     evidence = -0.5 * distinct * math.log(1.0 - min(r * r, LARGEST_R2))
     readings: list[Row] = []
-    for extent in field.extents:
+    for place in field.places:
         for scale in SOC_SCALES:
-            low, high = (scale * (end + extent.constant) for end in (values.min(), values.max()))
+            low, high = (scale * (end + place.constant) for end in (values.min(), values.max()))
             capacity_ah = 100.0 * moved / (spread * scale)
             if low > 0.0 and high <= 101.0 and is_capacity(capacity_ah) and capacity_ah > least_ah:
-                score = evidence + extent.nature
+                score = evidence + place.nature
                 score -= 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
                 text = f"{low:.3g} … {high:.3g} % at {scale:g} % a step ({capacity_ah:.0f} Ah)"
                 meant = Level(scale, high, text)
-                readings.append(Row(field, extent, field.missing, score, (meant,)))
+                readings.append(Row(field, place, field.missing, score, (meant,)))
     row = _likeliest(readings, by_scale=True)
     if row is None:
         return None
