@@ -61,6 +61,9 @@ which the search for it begins."""
 RIDGE: Final = 4.0
 """Prior precision of an amplitude in units of its larger bound."""
 
+_OF_A_FAULT: Final = ("resistance_step", "resistance_growth")
+"""Effects that no healthy pack has."""
+
 SOC_SCATTER, SOC_RESOLUTION_PCT, SOC_STANDS_OUT = 0.02, 0.7, 3.0
 """Usual scatter of counted charge over the change of a log's own SoC [-]; resolution of such a SoC
 [%], that of a start; and the standard deviations from which it is evidence: below, a gauge may
@@ -135,8 +138,17 @@ def _nuisance_columns(pack: Pack, time_s: FloatArray, soc_pct: FloatArray) -> Fl
 
 
 def _healthy_shapes(tried: Sequence[Shape]) -> IntArray:
-    """Return the indices of shapes that a healthy pack has too: every second, as they are alike."""
-    return np.array([k for k, shape in enumerate(tried) if shape.is_of_pack][::2], dtype=np.intp)
+    """Return the indices of shapes that a healthy pack has too: every second, as they are alike.
+
+    They are the mechanisms that the equation may lack.
+    """
+    found = [
+        k
+        for k, shape in enumerate(tried)
+        if shape.effect.id == "core_temperature"
+        or (shape.effect.adds_voltage and shape.effect.id not in _OF_A_FAULT)
+    ]
+    return np.array(found[::2], dtype=np.intp)
 
 
 def _untested() -> dict[str, float]:

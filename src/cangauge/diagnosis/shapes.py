@@ -21,8 +21,6 @@ from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates
 
 STEP_ID: Final = "resistance_step"
 
-GROWTH_ID: Final = "resistance_growth"
-
 PLACES: Final = tuple(float(part) for part in np.arange(10) / 10)
 """Places of a step of resistance, in parts of a log; at its start it has grown before."""
 
@@ -78,12 +76,6 @@ class Shape:
     def values(self, size: float) -> dict[str, float]:
         """Return the effect's parameters at a size relative to neutral."""
         return {**self.fixed, self.name: self.neutral + size}
-
-    @property
-    def is_of_pack(self) -> bool:
-        """Whether a healthy pack has some of it: a mechanism that the equation may lack."""
-        added = self.effect.adds_voltage and self.effect.id not in (STEP_ID, GROWTH_ID)
-        return added or self.effect.id == "core_temperature"
 
     @property
     def healthy_std(self) -> float:

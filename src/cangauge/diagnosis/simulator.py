@@ -16,7 +16,6 @@ import numpy as np
 
 from cangauge._text import significant
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.evidence import Evidence
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
@@ -29,20 +28,6 @@ voltage [V]; voltages by file or name of each log; or a `pybamm.Simulation`."""
 LEVEL_PART: Final = 0.01
 """A simulator is off everywhere where the mean difference is more than this part of the voltage,
 and more than what varies about it."""
-
-CORRECTIONS: Final = {
-    "capacity": "change the simulator's capacity by {change_pct:+.3g} %",
-    "initial_soc": "start the simulator with {offset_pct:+.3g} % SoC",
-    "coulombic_efficiency": "let the simulator count {efficiency:.4g} of the charging current",
-    "current_offset": "subtract {offset_a:.3g} A from the current that the simulator is given",
-    "current_gain": "divide the current that the simulator is given by {factor:.4g}",
-    "voltage_offset": "subtract {offset_v:.3g} V from the measured voltage, or add it to the"
-    " simulated one",
-    "voltage_gain": "divide the measured voltage by {factor:.4g}, or multiply the simulated one",
-    "time_skew": "shift the current that the simulator is given by {skew_s:+.3g} s",
-}
-"""Effect → what to change in the simulator's inputs, or in the measurement. The others add a
-voltage, by the equation in the model file."""
 
 
 def simulated_v(simulation: Simulation, log: Log) -> FloatArray:
@@ -110,15 +95,6 @@ class SimulatorGap:
     """Identified on the simulator's output."""
     remark: str
     """Where the simulator is off everywhere; "" else."""
-
-
-def correction(evidence: Evidence) -> str:
-    """Return what to change in a simulator for an effect, in one sentence."""
-    effect = evidence.shape.effect.id
-    values = evidence.shape.values(evidence.size)
-    factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
-    sentence = CORRECTIONS.get(effect, "add the voltage of {effect}")
-    return f"To correct the simulator: {sentence.format(effect=effect, factor=factor, **values)}."
 
 
 def simulator_gap(

@@ -14,7 +14,6 @@ import numpy as np
 from cangauge._text import counted, number, significant
 from cangauge.diagnosis.posterior import ALIKE, Posterior
 from cangauge.diagnosis.rows import COVER_PCT
-from cangauge.diagnosis.simulator import correction
 from cangauge.diagnosis.where import clause
 from cangauge.logs.gaps import bridge_s
 
@@ -101,11 +100,19 @@ def answer(found: Diagnosis) -> str:
         if found.simulator.remark:  # it says itself what to do
             lines = [found.simulator.remark, *(lines if found.posterior.stated else lines[:2])]
         if found.correction is not None:
-            lines.append(correction(found.correction.evidence))
+            lines.append(_simulator_change(found.correction.evidence))
     check = found.model_check
     if check is not None and not check.describes:
         lines = [*_model_lines(found, check), f"These logs: {_lower(lines[0])}", *lines[1:]]
     return "\n".join(lines)
+
+
+def _simulator_change(evidence: Evidence) -> str:
+    """Return what to change in a simulator's inputs, or in the measurement, in one sentence."""
+    effect, values = evidence.shape.effect.id, evidence.shape.values(evidence.size)
+    factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
+    change = FAULT[evidence.fault].get("simulator", {}).get(effect, "add the voltage of {effect}")
+    return f"To correct the simulator: {change.format(effect=effect, factor=factor, **values)}."
 
 
 def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
@@ -261,25 +268,15 @@ def caveats(found: Diagnosis) -> list[str]:
 
 def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows: each fault with its probability, size and remaining error."""
-    rows = [
-        [
-            _title(fault),
-            percent(p),
-            found.best_of(fault).shape.effect.id.replace("_", " "),
-            _amount(found, fault),
-            volts(found.corrections[fault].rmse_v),
-        ]
-        for fault, p in found.posterior.faults.items()
-    ]
+    rows = []
+    for fault, p in found.posterior.faults.items():
+        best = found.best_of(fault)
+        value, half = best.shape.neutral + best.size, best.half_width
+        ends = f"{significant(value - half, 2)} … {significant(value + half, 2)}"
+        size = f"{significant(value, 2, shown_unit(best.shape.unit))} ({ends})"
+        effect, left = best.shape.effect.id.replace("_", " "), found.corrections[fault].rmse_v
+        rows.append([_title(fault), percent(p), effect, size, volts(left)])
     return ["fault", "probability", "best shape", "size (95 %)", "error with it"], rows
-
-
-def _amount(found: Diagnosis, fault: str) -> str:
-    """Return the amplitude of a fault's best shape with its interval."""
-    of = next(item for item in found.best_of(fault).parameters.values() if item.ci is not None)
-    low, high = of.ci or (of.value, of.value)
-    ends = f"{significant(low, 2)} … {significant(high, 2)}"
-    return f"{significant(of.value, 2, shown_unit(of.unit))} ({ends})"
 
 
 def plan_text(found: Diagnosis) -> str:
