@@ -23,7 +23,7 @@ from cangauge.service.config import RunConfig
 from cangauge.service.output import Output
 from cangauge.service.own_frames import OwnFrames
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.polling import Poller
+from cangauge.service.polling import SLOWEST_S, Poller
 from cangauge.service.status import Monitor
 from cangauge.types import Estimate, Reason
 
@@ -32,8 +32,6 @@ _warn = partial(emit, _LOG, logging.WARNING)
 
 LATE_S: Final = 0.01
 """Longest time that due frames wait for a sample to arrive [s]."""
-NEVER_SEEN_S: Final = 60.0
-"""Time after which a signal that never came is logged [s]: replies are asked for once a minute."""
 FIRST_CHECKPOINT_S: Final = 1.0
 """Time of the first checkpoint [s]: early, for a service that is killed repeatedly."""
 
@@ -301,7 +299,7 @@ class Loop:
         if decoder.unsigned_current is not None:
             found["bus.unsigned_current"] = decoder.unsigned_current
         found |= {f"bus.wrong_period {name}": text for name, text in decoder.wrong_periods.items()}
-        if self._now_s - self._began_s > NEVER_SEEN_S:
+        if self._now_s - self._began_s > SLOWEST_S:  # each reply was asked for
             unseen = decoder.never_decoded
             found |= {f"bus.never_seen {role}": text for role, text in unseen.items()}
         return found

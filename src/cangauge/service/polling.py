@@ -17,8 +17,6 @@ from cangauge.bus.isotp import CONSECUTIVE, FIRST, LONGEST_GAP_S, PollTarget, Re
 EXCHANGE_WITHIN_S: Final = 5.0
 """Longest time from a request to its whole reply, also after "response pending" [s]: P2* of
 ISO 14229-2."""
-BETWEEN_S: Final = 0.05
-"""Shortest pause between an exchange and the next request [s]: P2 of ISO 14229-2."""
 PER_NODE_S: Final = 1.0
 """Shortest interval of the requests to one node, whatever it answers [s], as of drivers' apps."""
 SLOWEST_S: Final = 60.0
@@ -126,8 +124,6 @@ class Poller:
         # The exponent is bounded: 2 to the number of failures of a week is no float.
         wait_s = self._every_s * 2.0 ** min(self._failures[target], 16)
         self._due_s[target] = now_s + min(wait_s, max(SLOWEST_S, self._every_s))
-        for each, due_s in self._due_s.items():
-            self._due_s[each] = max(due_s, now_s + BETWEEN_S)
 
 
 def _frame(request_id: int, payload: bytes) -> can.Message:
