@@ -11,16 +11,8 @@ from scipy import special
 from cangauge._typing import FloatArray
 from cangauge.logs.quantities import CURRENT_FIELDS
 
-_FREQUENT: Final = (3, 6, 12, 50)
-"""Numbers of most frequent values whose differences are candidates for the quantum."""
-_MIN_PLACES: Final = 4
-"""Fewest occupied places of a grid."""
-_ON_PLACE: Final = 0.9
-"""Least share of the rows on a grid that hold the main value of their place."""
-_ON_GRID: Final = 0.95
-"""Least share of the rows on a grid."""
-_OFF_GRID: Final = 0.05
-"""Largest distance from a place of the grid, in quanta."""
+_ODD: Final = 0.05
+"""Share of rows off a grid that are allowed, and their distance from it in quanta [-]."""
 _HUGS: Final = 0.05
 """Largest distance of the reading nearest to zero from it, relative to the range [-]."""
 _BY_CHANCE: Final = 1e-4
@@ -45,7 +37,7 @@ def wrapped_current(
     current_a, voltage_v : array of shape (n,)
         Readings [A], of either sign, and voltage [V].
     """
-    if np.any(current_a > 0.0) and np.any(current_a < 0.0):
+    if current_a.min() < 0.0 < current_a.max():
         return None
     readings = np.abs(current_a)
     largest = float(readings.max())
@@ -62,21 +54,19 @@ def wrapped_current(
     ]
     if not fields:
         return None
-    wraps_at_a, _, _ = min(fields)
+    wraps_at_a = min(fields)[0]
     shows_step, step_a, bits = max(  # the coarsest step that the readings show
         (_is_multiple(readings, step_a), step_a, bits)
         for top_a, step_a, bits in fields
         if top_a == wraps_at_a
     )
+    is_wrapped = shows_step and bits in CURRENT_FIELDS["bits"][:3]  # never near zero: the usual
     if passes_zero:
-        unwrapped = np.where(is_high, readings - wraps_at_a, readings)
         moved_v = np.diff(voltage_v)
-        share = _explained(np.diff(unwrapped), moved_v)
+        share = _explained(np.diff(np.where(is_high, readings - wraps_at_a, readings)), moved_v)
         # Of the share that as many random steps explain (Student's t, as a beta distribution).
         by_chance = float(special.betainc(0.5 * max(steps.size - 1, 1), 0.5, 1.0 - share))
         is_wrapped = by_chance < _BY_CHANCE and share > _explained(steps, moved_v)
-    else:
-        is_wrapped = shows_step and bits in CURRENT_FIELDS["bits"][:3]  # never near zero: the usual
     return (wraps_at_a, bits, step_a) if is_wrapped else None
 
 
@@ -100,24 +90,21 @@ def quantum_of(values: FloatArray) -> float | None:
     neighbouring values, of the frequent ones and of all.
     """
     distinct, count = np.unique(values, return_counts=True)
-    if distinct.size < _MIN_PLACES:
+    if distinct.size < 4:
         return None
-    noise = 1e-9 * max(abs(float(distinct[0])), abs(float(distinct[-1])))
+    noise = 1e-9 * float(np.max(np.abs(distinct)))
     by_count = distinct[np.argsort(-count, kind="stable")]
-    groups = (*(by_count[:k] for k in _FREQUENT), distinct)
-    steps = [np.quantile(np.diff(np.sort(each)), [0.0, 0.02, 0.1, 0.5]) for each in groups]
-    for step in sorted({float(step) for each in steps for step in each}, reverse=True):
-        if step <= noise:
-            break
-        offset = (distinct - by_count[0]) / step
-        near = np.abs(offset - np.rint(offset)) < _OFF_GRID
-        place, weight = np.rint(offset[near]), count[near]
-        places, first = np.unique(place, return_index=True)
-        if places.size < _MIN_PLACES or weight.sum() < _ON_GRID * values.size:
+    from_origin = distinct - by_count[0]
+    groups = [np.sort(by_count[:most]) for most in (3, 6, 12, 50, distinct.size)]
+    steps = np.unique([np.quantile(np.diff(each), [0.0, 0.02, 0.1, 0.5]) for each in groups])
+    for step in steps[steps > noise][::-1].tolist():
+        place = np.rint(from_origin / step)
+        near = np.abs(from_origin / step - place) < _ODD
+        weight, (places, first) = count[near], np.unique(place[near], return_index=True)
+        if places.size < 4 or weight.sum() < (1.0 - _ODD) * values.size:
             continue
         # Several values at one place (64.98 and 65.00 on a grid of 65) mean a finer step.
-        if np.maximum.reduceat(weight, first).sum() >= _ON_PLACE * weight.sum():
-            from_origin = distinct[near] - by_count[0]
-            fitted = np.sum(weight * place * from_origin) / np.sum(weight * place * place)
-            return float(f"{fitted:.5g}")
+        if np.maximum.reduceat(weight, first).sum() >= (1.0 - 2.0 * _ODD) * weight.sum():
+            moment = np.sum(weight * place[near] * from_origin[near])
+            return float(f"{moment / np.sum(weight * place[near] ** 2):.5g}")
     return None

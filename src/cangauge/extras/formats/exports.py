@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -13,7 +14,6 @@ import pyarrow.compute as pc
 
 from cangauge._files import Head
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import shown_headings
 from cangauge.logs.draft import DraftLog
@@ -45,11 +45,9 @@ def _columns(cells: Sequence[str]) -> list[_Column]:
     return found
 
 
-def _find(columns: Sequence[_Column], patterns: Sequence[str]) -> _Column | None:
-    matches = (
-        column for pattern in patterns for column in columns if re.fullmatch(pattern, column.simple)
-    )
-    return next(matches, None)
+def _matching(columns: Sequence[_Column], *patterns: str) -> list[_Column]:
+    """Return the columns of some patterns, the first pattern's first."""
+    return [each for one in patterns for each in columns if re.fullmatch(one, each.simple)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,46 +123,38 @@ class Export:
         """
         header, skip_lines = self._header(head) or ([], 0)
         columns = _columns(header)
-        named = {name: _find(columns, patterns) for name, patterns in self.columns.items()}
-        ambient = _find(columns, (self.ambient,))
-        exclude = _find(columns, ("exclude",)) if self.bare else None
+        sensors, ambient = _matching(columns, self.sensors), _matching(columns, self.ambient)[:1]
+        named = {name: _matching(columns, *each)[:1] for name, each in self.columns.items()}
         pairs = {
-            instrument: {
-                quantity: column
-                for quantity, pattern in zip(_DRIVING, patterns, strict=True)
-                if (column := _find(columns, (pattern,))) is not None
-            }
+            instrument: [_matching(columns, pattern)[:1] for pattern in patterns]
             for instrument, patterns in self.instruments.items()
         }
-        sensors = [column for column in columns if re.fullmatch(self.sensors, column.simple)]
-        wanted = [*named.values(), ambient, exclude, *sensors]
-        wanted += [column for pair in pairs.values() for column in pair.values()]
+        excluded = _matching(columns, "exclude")[:1] if self.bare else []
+        wanted = chain(sensors, ambient, excluded, *named.values(), *chain(*pairs.values()))
         table = TextTable(head, self.delimiter, header, (), skip_lines, [])
-        cells = table.columns([column.place for column in wanted if column is not None])
+        cells = table.columns([column.place for column in wanted])
         draft = DraftLog(head.name, str(head.path))
         draft.remarks += [f"{self.name} export", *table.remarks]
-        for quantity, column in named.items():
-            if column is not None:
+        for quantity, found in named.items():
+            for column in found:
                 _take(draft, quantity, column, _values(draft, cells, column, quantity))
         _take_pair(draft, cells, pairs)
         for quantity in REQUIRED[:3]:
             if quantity not in draft.values:
                 problem = f"no column of this file holds it (found: {shown_headings(header)})"
                 cure = "check the export, or convert it to a canonical log"
-                raise InputError(problem, source=draft.source, field=quantity, cure=cure)
+                raise draft.error(quantity, problem, cure)
         if self.charges:
             draft.negate_current(f"{self.name} stores discharge as negative")
         self._take_temperature(draft, cells, sensors, ambient)
-        if exclude is not None:
-            yes = pc.equal(pc.utf8_trim_whitespace(cells[exclude.place]), "Yes")
-            is_excluded = np.asarray(pc.fill_null(yes, fill_value=False), dtype=bool)
-            draft.keep(~is_excluded, "that the cycler excludes dropped")
+        for column in excluded:
+            is_excluded = pc.fill_null(pc.equal(cells[column.place], "Yes"), fill_value=False)
+            draft.keep(~np.asarray(is_excluded, dtype=bool), "that the cycler excludes dropped")
         if self.waits:
-            waiting = draft.values["time_s"] < 0.0
-            if waiting.all():
-                problem, label = "all rows are before time 0", draft.labels["time_s"]
-                raise InputError(problem, source=draft.source, field=label, cure="check the export")
-            draft.keep(~waiting, "before time 0 (the wait before the test) dropped")
+            is_waiting = draft.values["time_s"] < 0.0
+            if is_waiting.all():
+                raise draft.error("time_s", "all rows are before time 0", "check the export")
+            draft.keep(~is_waiting, "before time 0 (the wait before the test) dropped")
         return draft
 
     def _take_temperature(
@@ -172,7 +162,7 @@ class Export:
         draft: DraftLog,
         cells: dict[int, Any],
         sensors: Sequence[_Column],
-        ambient: _Column | None,
+        ambient: Sequence[_Column],
     ) -> None:
         """Take the sensors, else the room's temperature or the set point, if any."""
         name = "temperature_c"
@@ -184,14 +174,15 @@ class Export:
             draft.temperature_source = self.source
             if len(probes) > 1:
                 draft.remarks.append(f"temperature: median of {len(probes)} columns")
-        elif ambient is not None:
-            _take(draft, name, ambient, _values(draft, cells, ambient, name))
+        for column in () if probes else ambient:
+            _take(draft, name, column, _values(draft, cells, column, name))
             draft.temperature_source = "room"
             draft.remarks.append("temperature: the room's, not the battery's")
-        found = list(re.finditer(self.set_point, Path(draft.source).name, re.IGNORECASE))
+        found = [*re.finditer(self.set_point, Path(draft.source).name, re.IGNORECASE)]
         if len(found) == 1 and not sensors:
-            groups = found[0].groupdict()
-            value_c = float(groups["value"]) * (-1.0 if groups.get("sign") == "N" else 1.0)
+            value_c = float(found[0]["value"])
+            if found[0].groupdict().get("sign") == "N":
+                value_c = -value_c
             draft.values[name] = np.full(draft.values["time_s"].size, value_c)
             draft.temperature_source = "room"
             shown = f"temperature {value_c:g} °C from the file name: the chamber's set point"
@@ -213,21 +204,23 @@ def _values(draft: DraftLog, cells: dict[int, Any], column: _Column, quantity: s
 
 
 def _take_pair(
-    draft: DraftLog, cells: dict[int, Any], pairs: dict[str, dict[str, _Column]]
+    draft: DraftLog, cells: dict[int, Any], pairs: dict[str, list[list[_Column]]]
 ) -> None:
     """Take current and voltage of the first instrument that has both."""
     taken: dict[str, tuple[str, _Column, FloatArray]] = {}
     for instrument, pair in pairs.items():
         own = {}
-        for quantity, column in pair.items():
-            values = _values(draft, cells, column, quantity)
-            if instrument and not np.isfinite(values).any():
-                draft.remarks.append(f"{column.text} is empty and was not used")
-            else:
-                own[quantity] = instrument, column, values
-        taken = {**taken, **own} if len(own) == len(_DRIVING) else {**own, **taken}
+        for quantity, found in zip(_DRIVING, pair, strict=True):
+            for column in found:
+                values = _values(draft, cells, column, quantity)
+                if instrument and not np.isfinite(values).any():
+                    draft.remarks.append(f"{column.text} is empty and was not used")
+                else:
+                    own[quantity] = instrument, column, values
         if len(own) == len(_DRIVING):
+            taken = own
             break
+        taken = own | taken
     for quantity, (instrument, column, values) in sorted(taken.items()):
         _take(draft, quantity, column, values)
         if instrument:

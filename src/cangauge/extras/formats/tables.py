@@ -161,33 +161,27 @@ class LongTable(Channels):
         value = next(lower.index(name) for name in cls._VALUES if name in lower)
         named = [place for place, name in enumerate(lower) if name in cls._NAMES]
         units = [place for place, name in enumerate(lower) if name in cls._UNITS]
-        time = text.headings.index(_time_of(text))
+        label = _time_of(text)
+        time = text.headings.index(label)
         cells = text.columns([0, value, time, *named, *units])
-        # Words ("unavailable") end a value. Headers and InfluxDB's notes stand above each table.
-        values = _as_numbers(cells[value])
-        is_header = pc.equal(_text_of(cells[time]), text.headings[time])
-        is_header = pc.or_(is_header, pc.starts_with(pc.fill_null(_text_of(cells[0]), ""), "#"))
-        known = pc.and_(pc.invert(pc.fill_null(is_header, True)), pc.is_valid(cells[time]))
-        cells = {place: column.filter(known) for place, column in cells.items()}
-        words = {place: _text_of(cells[place]) for place in [*named, *units]}
-        varying = [place for place in named if len(pc.unique(words[place])) > 1]
-        varying = varying or named[:1]
-        source, label = str(text.head.path), text.headings[time]
-        stamps, how = seconds_of([cells[time]], "", 1.0, source=source, label=label)
+        # Headers and InfluxDB's notes stand above each table.
+        is_note = pc.starts_with(pc.fill_null(cells[0].cast(pa.string()), ""), "#")
+        is_row = pc.and_not(pc.is_valid(cells[time]), is_note)
+        cells = {place: column.filter(is_row) for place, column in cells.items()}
+        words = {
+            place: pc.fill_null(cells[place].cast(pa.string()), "") for place in [*named, *units]
+        }
+        varying = [place for place in named if len(pc.unique(words[place])) > 1] or named[:1]
+        source = str(text.head.path)
+        stamps_s, how = seconds_of([cells[time]], "", 1.0, source=source, label=label)
+        if np.max(stamps_s, initial=0.0) < DAY_S:  # seconds of the day
+            stamps_s = over_midnight(stamps_s)
         parts = [words[place] for place in varying]
-        parts += [
-            pc.binary_join_element_wise("[", pc.fill_null(words[place], ""), "]", "")
-            for place in units
-        ]
-        parts = [pc.fill_null(part, "") for part in parts]
+        parts += [pc.binary_join_element_wise("[", words[place], "]", "") for place in units]
         names = pc.utf8_trim_whitespace(pc.binary_join_element_wise(*parts, " "))
         names = pc.replace_substring(names, " []", "").combine_chunks().dictionary_encode()
-        if np.max(stamps, initial=0.0) < DAY_S:  # seconds of the day
-            stamps = over_midnight(stamps)
-        label_of_names = " and ".join(text.headings[place] for place in varying)
-        return cls(
-            label_of_names, label, how, _by_name(names, stamps, values.filter(known).to_numpy())
-        )
+        names_of = " and ".join(text.headings[place] for place in varying)
+        return cls(names_of, label, how, _by_name(names, stamps_s, _numbers(cells[value])))
 
     @property
     def headings(self) -> list[str]:
@@ -264,17 +258,12 @@ def _time_of(text: TextTable) -> str:
     return min(times, key=itemgetter(0), default=(0, ""))[1]
 
 
-def _text_of(cells: Any) -> Any:
-    return cells.cast(pa.string())
-
-
-def _as_numbers(cells: Any) -> Any:
-    if not is_text(cells):
-        return cells.combine_chunks()
-    trimmed = pc.utf8_trim_whitespace(pc.replace_substring(cells.cast(pa.string()), ",", "."))
-    is_number = pc.match_substring_regex(trimmed, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-    numbers = pc.if_else(is_number, trimmed, pa.scalar(None, pa.string()))
-    return pc.fill_null(pc.cast(numbers, pa.float64()), float("nan")).combine_chunks()
+def _numbers(cells: Any) -> FloatArray:
+    """Return the numbers in cells, NaN where a word ("unavailable") ends a value."""
+    if is_text(cells):
+        is_number = pc.match_substring_regex(cells, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+        cells = pc.if_else(is_number, cells, pa.scalar(None, pa.string()))
+    return np.asarray(pc.cast(cells, pa.float64()).to_numpy())
 
 
 READERS: Final = (Workbook(), LongTable)
