@@ -135,6 +135,17 @@ def test_heading_unit_and_factor_are_told_apart(
     assert (headings[column.places[0]], column.unit, column.factor) == expected
 
 
+@pytest.mark.parametrize(
+    ("heading", "quantity"),
+    [("Current SoC [%]", "soc"), ("Time of Voltage [V]", "voltage"), ("x" * 300, None)],
+)
+def test_current_may_be_an_adjective_and_time_the_instant_of_anything(
+    heading: str, quantity: str | None
+) -> None:
+    meaning = meaning_of(heading)
+    assert (meaning and meaning.quantity) == quantity
+
+
 def test_unit_of_another_quantity_refutes_a_heading() -> None:
     assert meaning_of("Current", "km/h") is not None  # the row of units is not always one
     assert meaning_of("Current [km/h]") is None

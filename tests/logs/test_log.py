@@ -175,6 +175,14 @@ def test_table_of_any_types_and_columns() -> None:
         Log.from_dataframe(table(), temperature_source="oven")
     with pytest.raises(InputError, match=r"not a log .got 'int'.; give a Log, the path of one"):
         Log.from_dataframe(7)
+    with pytest.raises(InputError, match=r"columns: not columns .got 7.; give NAME=HEADING"):
+        Log.from_dataframe(table(), columns=7)
+
+
+def test_a_parquet_file_of_too_many_columns_is_refused(tmp_path: Path) -> None:
+    pq.write_table(pa.table({f"c{k}": [1.0] for k in range(10_001)}), tmp_path / "x.parquet")
+    with pytest.raises(InputError, match="more than the 10000 columns that a log may have"):
+        open_log(tmp_path / "x.parquet").read()
 
 
 @pytest.mark.parametrize("kind", ["parquet", "frame", "index"])

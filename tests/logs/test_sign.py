@@ -86,6 +86,14 @@ def test_commands_can_refuse_an_inverted_log() -> None:
         require_discharge_positive(turned(log))
 
 
+def test_an_inverted_soc_may_be_what_is_wrong() -> None:
+    time = np.arange(0.0, 3600.0)
+    current, level = np.full(time.size, 30.0), np.full(time.size, 20.0)
+    log = Log(time, current, level + 360.0, level, soc_pct=50.0 + time / 360.0)
+    with pytest.raises(InputError, match="or, if the current is right, correct soc_pct"):
+        require_discharge_positive(log)
+
+
 def test_steps_are_the_changes_over_a_second() -> None:
     time = np.arange(0.0, 60.0, 0.1)
     current = np.where(time >= 30.0, 50.0, 0.0)

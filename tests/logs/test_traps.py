@@ -503,6 +503,14 @@ def test_offsets_of_dates_are_taken_into_account(tmp_path: Path) -> None:
     assert "date with zone" in log.assumed[0]
 
 
+def test_an_order_of_days_and_months_is_that_of_fewer_days(tmp_path: Path) -> None:
+    stamps = ["03/04/2024 23:59:58", "03/04/2024 23:59:59", "04/04/2024 00:00:00"]
+    rows = [f"{stamp},{k},360,20" for k, stamp in enumerate(stamps)]
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    assert log.duration_s == 2.0
+    assert log.assumed[0] == 'time = "Time" [date (day first, assumed) without zone]'
+
+
 @pytest.mark.parametrize("mark", [" ", ","])
 def test_local_dates_of_a_zone_are_seconds_since_1970(tmp_path: Path, mark: str) -> None:
     """In spring an hour is missing: it is no gap of the log."""

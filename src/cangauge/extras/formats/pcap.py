@@ -15,7 +15,14 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import can
-from can.interfaces.socketcan.constants import CAN_ERR_FLAG, MSK_ARBID
+from can.interfaces.socketcan.constants import (
+    CAN_EFF_FLAG,
+    CAN_ERR_FLAG,
+    CAN_RTR_FLAG,
+    CANFD_BRS,
+    CANFD_ESI,
+    MSK_ARBID,
+)
 from can.io.generic import BinaryIOMessageReader
 
 from cangauge.bus.readers import CaptureReader
@@ -30,10 +37,8 @@ _MAX_PACKET: Final = 256 * 1024
 """Largest snapshot length of libpcap [bytes]."""
 _MAX_BLOCK: Final = 1024 * 1024
 """Largest block of a PCAPNG file that is read [bytes]."""
-_EXTENDED, _REMOTE = 0x80000000, 0x40000000
-_BRS, _ESI, _FDF = 0x01, 0x02, 0x04
-_XL: Final = 0x80
-"""Bit of the fifth byte that marks a frame of CAN XL."""
+_FDF, _XL = 0x04, 0x80
+"""Bits that mark a frame of CAN FD in its flags, and one of CAN XL in its fifth byte."""
 
 
 class _Interface(NamedTuple):
@@ -172,19 +177,19 @@ class PcapReader(CaptureReader, BinaryIOMessageReader):
             return None
         number, length, flags = struct.unpack_from(order + "IBB", packet)
         is_fd = protocol == _SLL_CAN_FD or bool(flags & _FDF) or length > 8
-        is_remote = bool(number & _REMOTE) and not is_fd
+        is_remote = bool(number & CAN_RTR_FLAG) and not is_fd
         data = b"" if is_remote else packet[8 : 8 + length]
         if length > (64 if is_fd else 8) or (not is_remote and len(data) < length):
             self.skip(None)
             return None
         return can.Message(
             arbitration_id=number & MSK_ARBID,
-            is_extended_id=bool(number & _EXTENDED),
+            is_extended_id=bool(number & CAN_EFF_FLAG),
             is_remote_frame=is_remote,
             is_error_frame=bool(number & CAN_ERR_FLAG),
             is_fd=is_fd,
-            bitrate_switch=is_fd and bool(flags & _BRS),
-            error_state_indicator=is_fd and bool(flags & _ESI),
+            bitrate_switch=is_fd and bool(flags & CANFD_BRS),
+            error_state_indicator=is_fd and bool(flags & CANFD_ESI),
             is_rx=is_rx,
             channel=channel,
             dlc=length,

@@ -338,11 +338,13 @@ class AscReader(LineReader):
     _HEAD: Final = re.compile(r"(?im)^\s*base\s+(hex|dec)(?:\s+timestamps\s+(relative|absolute))?")
     _STAMP: Final = re.compile(r"\s*+(-?\d{1,12}\.\d+)\s++(.*)")
     _CLASSIC: Final = re.compile(
-        r"(\d+)\s++(\w+?)(x?)\s++(Rx|Tx|TxRq)\s++([dr])(?:\s++([0-9A-Fa-f]{1,2}))?(?=\s|$)(.*)"
+        r"(?P<channel>\d+)\s++(?P<id>\w+?)(?P<long>x?)\s++(?P<way>Rx|Tx|TxRq)\s++(?P<kind>[dr])"
+        r"(?:\s++(?P<code>[0-9A-Fa-f]{1,2}))?(?=\s|$)(?P<rest>.*)"
     )
     _FD: Final = re.compile(
-        r"CANFD\s++(\d+)\s++(Rx|Tx|TxRq)\s++(\w+?)(x?)\s++(?:[^\s\d]\S*+\s++)?([01])\s++([01])"
-        r"\s++([0-9A-Fa-f]{1,2})\s++(\d{1,2})(?=\s|$)(.*)"
+        r"CANFD\s++(?P<channel>\d+)\s++(?P<way>Rx|Tx|TxRq)\s++(?P<id>\w+?)(?P<long>x?)\s++"
+        r"(?:[^\s\d]\S*+\s++)?(?P<switch>[01])\s++(?P<state>[01])\s++(?P<code>[0-9A-Fa-f]{1,2})"
+        r"\s++(?P<length>\d{1,2})(?=\s|$)(?P<rest>.*)"
     )
     _ERROR: Final = re.compile(r"(?:CANFD\s++)?(\d+)\s++(?:(?:Rx|Tx)\s++)?ErrorFrame\b")
     _OF_FRAME: Final = re.compile(r"CANFD\b|\d+\s++\S++\s++(?:Rx|Tx|TxRq)\b")
@@ -386,42 +388,38 @@ class AscReader(LineReader):
                 return None
             raise ValueError("not a frame")
         time_s, event = float(stamp[1]), stamp[2]
-        more: dict[str, bool] = {}
         if self._is_added:
             self._time_s += time_s
             time_s = self._time_s
-        if match := self._ERROR.match(event):
-            return frame(time_s, 0, "", channel=int(match[1]) - 1, is_error_frame=True)
-        if match := self._CLASSIC.match(event):
-            channel, number, extended, way, kind, length, rest = match.groups()
-            if kind == "d" and length is None:
-                raise ValueError("its length is missing")
-            size = min(int(length or "0", self._base), 8)
-            data = self._data(rest, size, line) if kind == "d" else None
-        elif match := self._FD.match(event):
-            channel, way, number, extended, switch, state, code, length, rest = match.groups()
-            size = int(length)
-            is_remote = size == 0 and code != "0"
-            data = None if is_remote else self._data(rest, size, line)
-            size = int(code, 16) if is_remote else size
-            more = {
-                "is_fd": True,
-                "bitrate_switch": switch == "1",
-                "error_state_indicator": state == "1",
-            }
-        elif self._OF_FRAME.match(event):
-            raise ValueError("not a frame")
-        else:
+        if error := self._ERROR.match(event):
+            return frame(time_s, 0, "", channel=int(error[1]) - 1, is_error_frame=True)
+        match = self._CLASSIC.match(event) or self._FD.match(event)
+        if match is None:
+            if self._OF_FRAME.match(event):
+                raise ValueError("not a frame")
             return None
+        of = match.groupdict()
+        is_fd, code = "switch" in of, of["code"]
+        if is_fd:
+            size = int(of["length"])
+            is_remote = size == 0 and code != "0"
+            size = int(code, 16) if is_remote else size
+        else:
+            is_remote = of["kind"] == "r"
+            size = min(int(code or "0", self._base), 8)
+            if code is None and not is_remote:
+                raise ValueError("its length is missing")
         return frame(
             time_s,
-            int(number, self._base),
-            data,
+            int(of["id"], self._base),
+            None if is_remote else self._data(of["rest"], size, line),
             size,
-            is_extended=bool(extended),
-            channel=int(channel) - 1,
-            is_rx=way == "Rx",
-            **more,
+            is_extended=bool(of["long"]),
+            channel=int(of["channel"]) - 1,
+            is_rx=of["way"] == "Rx",
+            is_fd=is_fd,
+            bitrate_switch=of.get("switch") == "1",
+            error_state_indicator=of.get("state") == "1",
         )
 
     def _data(self, rest: str, size: int, line: str) -> str:
