@@ -52,12 +52,8 @@ _SPELLINGS: Final = (
     (r"^(\d+)\.(\d{2}:\d{2}:\d{2})", r"\1d \2"),
     (r"^(\d{3}):(\d{2}:\d{2}:\d{2})$", r"\1d \2"),
 )
-_MONTH_NAMES: Final = "jan feb mar/mrz apr may/mai jun jul aug sep oct/okt nov dec/dez"
-_MONTHS: Final = {
-    name: float(number)
-    for number, names in enumerate(_MONTH_NAMES.split(), start=1)
-    for name in names.split("/")
-}
+_MONTHS: Final = "jan feb mar apr may jun jul aug sep oct nov dec"
+_GERMAN: Final = {"mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 _ORDERS: Final = ("ymd", "dmy", "mdy")
 _DIGITS: Final = r"^(19|20)?\d{2}(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}$"
 """`20240313235000` and `240313235000`."""
@@ -80,8 +76,7 @@ def is_clock(text: str) -> bool:
 
 def _match(cells: Sequence[str], pattern: str) -> BoolArray:
     alike = _spelled_alike(pa.array(cells, pa.string()))
-    found: BoolArray = pc.match_substring_regex(alike, pattern).to_numpy(zero_copy_only=False)
-    return found
+    return np.asarray(pc.match_substring_regex(alike, pattern), dtype=bool)
 
 
 def _spelled_alike(cells: Any) -> Any:
@@ -117,10 +112,7 @@ def seconds_of(
     order_or_zone = unit if is_format else ""
     column, kind = parts[0], parts[0].type
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-        counts = column.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
-        tick_s, _ = unit_of("time_s", kind.unit) or (1.0, 0.0)
-        seconds = np.asarray(counts, dtype=np.float64) / round(1.0 / tick_s)
-        return seconds, str(kind) if is_format or not unit else unit
+        return _since_1970(column), str(kind) if is_format or not unit else unit
     if len(parts) > 1:
         joined = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
         return seconds_of_text(joined, order_or_zone, source, label)
@@ -136,6 +128,13 @@ def seconds_of(
     unit = "" if is_format else unit
     values = values if factor == 1.0 else values * factor
     return _seconds_of_numbers(values, unit or in_cells, source, label)
+
+
+def _since_1970(stamps: Any) -> FloatArray:
+    """Return stamps or durations of Arrow in seconds, NaN where missing."""
+    tick_s, _ = unit_of("time_s", stamps.type.unit) or (1.0, 0.0)
+    counts = np.asarray(stamps.cast(pa.int64()).cast(pa.float64(), safe=False), dtype=np.float64)
+    return counts / round(1.0 / tick_s)
 
 
 def _zone_of(name: str) -> ZoneInfo | None:
@@ -201,23 +200,21 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     if iso is not None:
         return iso
     spelled = _spelled_alike(cells)
-    known = np.asarray(pc.is_valid(spelled).to_numpy(zero_copy_only=False), dtype=bool)
-    first = spelled[int(np.argmax(known))].as_py() if known.any() else ""
-    parts = pc.extract_regex(spelled, _CLOCK_TIME if is_clock(first) else _DATE_TIME)
-    read = np.asarray(pc.is_valid(parts).to_numpy(zero_copy_only=False), dtype=bool)
-    if np.any(known & ~read):
-        row = int(np.argmax(known & ~read))
-        problem, value = f"row {row + 1} is not a time", cells[row].as_py()
+    is_clock_time = is_clock(first_text(spelled))
+    parts = pc.extract_regex(spelled, _CLOCK_TIME if is_clock_time else _DATE_TIME)
+    read = np.asarray(pc.is_valid(parts), dtype=bool)
+    wrong = np.flatnonzero(np.asarray(pc.is_valid(spelled), dtype=bool) & ~read)
+    if wrong.size:
+        problem, value = f"row {wrong[0] + 1} is not a time", cells[int(wrong[0])].as_py()
         cure = "seconds, hh:mm:ss or dates are read; name another column with --columns time=…"
         raise InputError(problem, source=source, field=label, value=value, cure=cure)
     hours, minutes, seconds = (np.nan_to_num(_numbers(parts, name)) for name in "hms")
     half = _words(parts, "half")
     hours = np.where(half == "", hours, hours % 12 + np.where(half == "p", 12.0, 0.0))
     of_day_s = np.where(read, hours * 3600.0 + minutes * 60.0 + seconds, np.nan)
-    if not is_clock(first):
+    if not is_clock_time:
         return _dates(parts, of_day_s, unit)
-    values = np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s
-    return over_midnight(values), "clock time"
+    return over_midnight(np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s), "clock time"
 
 
 def _iso_dates(cells: Any, unit: str) -> tuple[FloatArray, str] | None:
@@ -230,9 +227,7 @@ def _iso_dates(cells: Any, unit: str) -> tuple[FloatArray, str] | None:
     """
     for zone in (None, "UTC"):
         with suppress(pa.ArrowInvalid):
-            stamps = pc.cast(cells, pa.timestamp("us", zone))
-            micros = stamps.cast(pa.int64()).cast(pa.float64())
-            values = np.asarray(micros.to_numpy(zero_copy_only=False), dtype=np.float64) / 1e6
+            values = _since_1970(pc.cast(cells, pa.timestamp("us", zone)))
             return (values, "date with zone") if zone else _in_zone(values, "date", unit)
     return None
 
@@ -245,9 +240,12 @@ def over_midnight(of_day_s: FloatArray) -> FloatArray:
 
 
 def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str]:
-    months = np.array([_MONTHS.get(word, np.nan) for word in _words(parts, "b")])
-    is_word = bool(np.isfinite(months).any())
-    middle = months if is_word else _numbers(parts, "b")
+    words, middle, is_word = _words(parts, "b"), _numbers(parts, "b"), False
+    for word in set(words) - {""}:
+        place = _MONTHS.find(_GERMAN.get(word, word))
+        if place >= 0:
+            middle[words == word] = 1 + place // 4
+            is_word = True
     fields = np.array([_numbers(parts, "a"), middle, _numbers(parts, "c")])
     known = np.isfinite(fields).all(axis=0)
     order, how = _order(fields[:, known], unit.lower(), is_word=is_word)
@@ -268,8 +266,7 @@ def _in_zone(values: FloatArray, how: str, unit: str) -> tuple[FloatArray, str]:
         return values, f"{how} without zone"
     local = pa.array(values * 1e6, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
     utc = pc.assume_timezone(local, zone.key, ambiguous="earliest", nonexistent="latest")
-    micros = utc.cast(pa.int64()).cast(pa.float64()).to_numpy(zero_copy_only=False)
-    return np.asarray(micros) / 1e6, f"{how} in {zone.key}"
+    return _since_1970(utc), f"{how} in {zone.key}"
 
 
 def _order(fields: FloatArray, unit: str, *, is_word: bool) -> tuple[str, str]:
@@ -300,10 +297,10 @@ def _numbers(parts: Any, name: str) -> FloatArray:
     text = pc.replace_substring_regex(parts.field(name), "[,:]", ".")
     is_number = pc.match_substring_regex(text, r"^\d+(\.\d+)?$")
     numbers = pc.cast(pc.if_else(is_number, text, pa.scalar(None, pa.string())), pa.float64())
-    return np.asarray(numbers.to_numpy(zero_copy_only=False), dtype=np.float64)
+    return np.asarray(numbers, dtype=np.float64)
 
 
 def _words(parts: Any, name: str) -> Any:
     """Return a group in lower case, "" where it is empty."""
     text = pc.fill_null(pc.utf8_lower(parts.field(name)), "")
-    return np.asarray(text.to_numpy(zero_copy_only=False), dtype=object)
+    return np.asarray(text, dtype=object)

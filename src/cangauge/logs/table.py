@@ -309,30 +309,26 @@ def _hold_changes(draft: DraftLog) -> None:
     at = np.flatnonzero(np.isfinite(time + current))
     if np.mean(whole) >= 1.0 - MAX_INCOMPLETE or not at.size:
         return
-    latest_v, age_s = held(time, voltage, at)
-    near = age_s <= _HOLD_S
-    if np.mean(near) < 0.5:
+    rows = _latest(time + voltage, at)
+    age_s = time[at] - time[rows]
+    is_near = (rows <= at) & (age_s <= _HOLD_S)
+    if np.mean(is_near) < 0.5:
         return
-    at = at[near]
-    draft.values = {"time_s": time[at], "current_a": current[at], "voltage_v": latest_v[near]}
+    at, rows, age_s = at[is_near], rows[is_near], age_s[is_near]
+    draft.values = {"time_s": time[at], "current_a": current[at], "voltage_v": voltage[rows]}
     for name in values.keys() - draft.values.keys():
-        draft.values[name], _ = held(time, values[name], at)
-    temperature = draft.values.get("temperature_c", np.empty(0))
-    is_known = np.isfinite(temperature)
-    if is_known.any():  # before the first value, the first
-        temperature[~is_known] = temperature[is_known][0]
+        rows = _latest(time + values[name], at)
+        draft.values[name] = values[name][rows]
+        if name != "temperature_c":  # of which the first value is taken before it
+            draft.values[name][rows > at] = np.nan
     draft.remarks.append(
         f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
-        f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
+        f" (at most {float(age_s.max()):.2g} s old) and temperature"
     )
 
 
-def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the latest known value at some rows, and its age [s]; NaN and infinity before any."""
-    known = np.flatnonzero(np.isfinite(values) & np.isfinite(time))
+def _latest(values: FloatArray, at: IntArray) -> IntArray:
+    """Return by row the latest one whose value is known, the first where none is known before."""
+    known = np.flatnonzero(np.isfinite(values))
     latest = np.searchsorted(known, at, side="right") - 1
-    if not known.size:
-        return np.full(at.size, np.nan), np.full(at.size, np.inf)
-    row = known[np.maximum(latest, 0)]
-    before = latest < 0
-    return np.where(before, np.nan, values[row]), np.where(before, np.inf, time[at] - time[row])
+    return known[np.maximum(latest, 0)] if known.size else at

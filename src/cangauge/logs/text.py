@@ -18,7 +18,7 @@ import pyarrow.csv as pacsv
 from cangauge._files import HEAD_BYTES, Head, as_utf8
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import Choice, are_canonical, choose_columns
+from cangauge.logs.columns import NEEDED, Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps, is_stamp
@@ -156,9 +156,10 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         with suppress(InputError):  # no column has a heading that the user names
             choice = choose_columns(table.headings, (), given)
             if choice.is_complete:
-                return _above_data(table, given)
-            canonical = canonical or (table if choice.is_canonical else None)
-    return canonical and _above_data(canonical, given)
+                return _above_data(table, choice, given)
+            if choice.is_canonical and canonical is None:
+                canonical = _above_data(table, choice, given)
+    return canonical
 
 
 def headed(head: Head, rows: int) -> Iterator[TextTable]:
@@ -174,15 +175,14 @@ def headed(head: Head, rows: int) -> Iterator[TextTable]:
             yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
-def _above_data(table: TextTable, given: ColumnMap | None) -> TextTable:
+def _above_data(table: TextTable, choice: Choice, given: ColumnMap | None) -> TextTable:
     """Return a table less the rows above its data, of which one may hold units.
 
     A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
     Below canonical names, it repeats their units; any other row is data.
     """
-    choice = choose_columns(table.headings, (), given)
     chosen = choice.chosen
-    measured = [chosen[k].places[-1] for k in ("time", "current", "voltage") if k in chosen]
+    measured = [chosen[name].places[-1] for name in NEEDED if name in chosen]
     units, first = list[str](), table.skip_lines
     for number, line in enumerate(table.head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
         row = split_cells(line, table.delimiter)
