@@ -156,12 +156,11 @@ def _in_canonical_units(
     for field, (_, value, problem, cure, _) in wrong.items():  # the first is raised
         sure = {each: column for each, column in named.items() if len(column[1]) == 1}
         options = sure if field in sure else {field: named[field]} if field in named else {}
+        how = f"{cure} (or state the unit: {_option(options)})" if options else cure
         if len(options) > 1:
-            cure = f"state the units: {_option(options)}"  # noqa: PLW2901
-        elif options:
-            cure = f"{cure} (or state the unit: {_option(options)})"  # noqa: PLW2901
+            how = f"state the units: {_option(options)}"
         where, label = log.source or log.name, labels.get(field, field)
-        raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
+        raise InputError(problem, source=where, field=label, value=float(value), cure=how)
     if usual_c <= LIMITS["unusually_hot_c"]:
         return log
     doubt = f": if it is °F, state the unit: {_option({'temperature_c': (label_c, ['°F'])})}"

@@ -8,6 +8,7 @@ pack may have rested, or been charged or driven.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -73,17 +74,17 @@ def split_where_moved(log: Log) -> list[Log]:
     """
     if log.soc_pct is None:
         return [log]
-    known = np.flatnonzero(np.isfinite(log.soc_pct))
-    cuts = [0]
-    for row in uncounted_gaps(log.time_s).tolist():
-        before, after = known[known <= row], known[known > row]
-        if before.size and after.size:
-            moved = float(log.soc_pct[after[0]] - log.soc_pct[before[-1]])
-            if abs(moved) >= MOVED_PCT:
-                cuts.append(row + 1)
-    if len(cuts) == 1:
+    gaps, known = uncounted_gaps(log.time_s), np.flatnonzero(np.isfinite(log.soc_pct))
+    after = np.searchsorted(known, gaps, side="right")
+    is_between = (after > 0) & (after < known.size)
+    gaps, after = gaps[is_between], after[is_between]
+    moved_pct = log.soc_pct[known[after]] - log.soc_pct[known[after - 1]]
+    cuts = gaps[np.abs(moved_pct) >= MOVED_PCT] + 1
+    if not cuts.size:
         return [log]
-    ends = [*cuts[1:], len(log)]
-    pieces = [log.rows(slice(first, last)) for first, last in zip(cuts, ends, strict=True)]
-    kept = [(k, piece) for k, piece in enumerate(pieces, start=1) if piece.duration_s >= PIECE_S]
-    return [replace(piece, name=f"{log.name} part {k}") for k, piece in kept] or [log]
+    ends = pairwise([0, *cuts.tolist(), len(log)])
+    pieces = (
+        replace(log.rows(slice(*each)), name=f"{log.name} part {k}")
+        for k, each in enumerate(ends, start=1)
+    )
+    return [piece for piece in pieces if piece.duration_s >= PIECE_S] or [log]

@@ -162,23 +162,26 @@ def _meaning(name: str, unit: str) -> Meaning | None:
     quantity = _quantity(words, name, unit)
     if quantity is None:
         return None
-    others = _others(words, quantity, unit)
+    of = QUANTITIES[quantity]
+    names = of.words | (of.words_with_unit if of.scale_of(unit) else frozenset())
+    others = {*words} - (_LETTERS.keys() if names.isdisjoint(words) else names)
+    ticks = [word for word in words if word in WORDS["ticks"]]
     if quantity == "time":
         if _CLOCK.match(unit):
             unit = ""
-        ticks = [word for word in others if word in WORDS["ticks"]]
         if ticks and not unit:  # TimeUS
             unit = ticks[-1]
-            others = [word for word in others if word != unit]
-    if unit and QUANTITIES[quantity].scale_of(unit) is None:
+            others.discard(unit)
+    if unit and of.scale_of(unit) is None:
         return None
     in_name = re.findall(r"[\[(]([^\[\]()]*)[\])]", name) + name.split("/")[1:]
     if not unit and any(_is_unit(text.strip().lower()) for text in in_name if text.strip()):
         return None  # of another quantity
-    if quantity == "time":
-        is_by_tick = bool(ticks) and QUANTITIES["time"].words.isdisjoint(words)  # ms_today
-        return Meaning(quantity, unit, Rank.GUESS if is_by_tick else _rank_of_time(set(others)))
-    return _measured(quantity, unit, set(others))
+    if quantity != "time":
+        return _measured(quantity, unit, others)
+    is_by_tick = bool(ticks) and of.words.isdisjoint(words)  # ms_today
+    is_date = bool(words) and WORDS["date"].issuperset(words)
+    return Meaning(quantity, unit, Rank.GUESS if is_by_tick else _rank_of_time(others, is_date))
 
 
 def _quantity(words: list[str], name: str, unit: str) -> str | None:
@@ -223,65 +226,48 @@ def _quantity_of_letter(words: list[str], name: str, unit: str) -> str | None:
     return "time" if not unit and WORDS["ticks"].intersection(words) else None  # ms_today
 
 
-def _others(words: list[str], quantity: str, unit: str) -> list[str]:
-    """Return the words beside those that name the quantity."""
-    of = QUANTITIES[quantity]
-    names = of.words | (of.words_with_unit if of.scale_of(unit) else frozenset())
-    if names.isdisjoint(words):
-        return [word for word in words if word not in _LETTERS]
-    is_date = WORDS["date"].issuperset(words)
-    return ["(date)"] if is_date else [word for word in words if word not in names]
-
-
-def _rank_of_time(words: set[str]) -> Rank:
+def _rank_of_time(words: set[str], is_date: bool) -> Rank:
+    if is_date:
+        return Rank.DERIVED
     if words & (WORDS["other"] | WORDS["extreme"] | WORDS["other_time"]):
         return Rank.GUESS
     if words & WORDS["elapsed"]:
         return Rank.DIRECT
-    if words - WORDS["neutral"] - {"(date)"}:
-        return Rank.PART
-    return Rank.DERIVED if "(date)" in words else Rank.PLAIN
+    return Rank.PART if words - WORDS["neutral"] else Rank.PLAIN
 
 
 def _measured(quantity: str, unit: str, words: set[str]) -> Meaning:
     """Return the meaning of a measured value with these other words."""
     named = {word for word in words if not word.isdigit()}
     is_numbered = len(named) < len(words)
-    if quantity != "temperature":
-        is_other = "12" in words or bool(named & WORDS["extreme"])
-        is_vague = is_numbered and "1" not in words
-        rank = Rank.OTHER if is_other else _rank(named, is_part=is_numbered, is_vague=is_vague)
-        return Meaning(quantity, unit, Rank.GUESS if rank is Rank.AMBIENT else rank, is_numbered)
-    sources = (place for place, group in _SOURCES.items() if named & WORDS[group])
-    source = next(sources, _UNKNOWN)
-    named -= WORDS["probe"]
-    if named & WORDS["auxiliary"]:
-        named = named - WORDS["auxiliary"] | {"battery"}
-        is_numbered = True
     is_extreme = bool(named & WORDS["extreme"])
-    named -= WORDS["extreme"]
-    is_vague = is_extreme and not named & WORDS["cell"]
-    rank = Rank.OTHER if "12" in words else _rank(named, is_part=is_extreme, is_vague=is_vague)
-    return Meaning(quantity, unit, rank, is_numbered or is_extreme, source)
-
-
-def _rank(named: set[str], *, is_part: bool, is_vague: bool) -> Rank:
-    """Return the rank by the other words of a heading.
-
-    `is_part`: one of several values of the pack. `is_vague`: of which only a word for the pack says
-    that it is the pack's.
-    """
-    known = WORDS["pack"] | WORDS["neutral"] | WORDS["cell"] | WORDS["display"] | WORDS["ambient"]
+    is_other, source = "12" in words, _UNKNOWN
+    # One of several values of the pack; and one of which only a word for the pack says that.
+    is_part, is_vague = is_numbered, is_numbered and "1" not in words
+    if quantity == "temperature":
+        sources = (place for place, group in _SOURCES.items() if named & WORDS[group])
+        source = next(sources, _UNKNOWN)
+        if named & WORDS["auxiliary"]:
+            named.add("battery")
+            is_numbered = True
+        named -= WORDS["probe"] | WORDS["auxiliary"] | WORDS["extreme"]
+        is_numbered = is_numbered or is_extreme
+        is_part, is_vague = is_extreme, is_extreme and not named & WORDS["cell"]
+    else:
+        is_other = is_other or is_extreme
+    of_cells = WORDS["cell"] | WORDS["display"]
     is_of_pack = bool(named & WORDS["pack"])
-    has_unknown = bool(named - known)
-    is_derived = bool(named & (WORDS["cell"] | WORDS["display"] | WORDS["derived"]))
+    has_unknown = bool(named - WORDS["pack"] - WORDS["neutral"] - WORDS["ambient"] - of_cells)
+    is_ambient = bool(named & WORDS["ambient"])
     ranks = (
-        (bool(named & WORDS["other"]), Rank.OTHER),
-        (bool(named & WORDS["ambient"]), Rank.AMBIENT),
+        (is_other or bool(named & WORDS["other"]), Rank.OTHER),
+        (is_ambient, Rank.AMBIENT if quantity == "temperature" else Rank.GUESS),
         (not is_of_pack and (has_unknown or is_vague), Rank.GUESS),
         (has_unknown or is_part, Rank.PART),
-        (is_derived, Rank.DERIVED),
+        (bool(named & (of_cells | WORDS["derived"])), Rank.DERIVED),
         (is_of_pack, Rank.DIRECT),
         (bool(named), Rank.PLAIN),
+        (True, Rank.BARE),
     )
-    return next((rank for holds, rank in ranks if holds), Rank.BARE)
+    rank = next(rank for holds, rank in ranks if holds)
+    return Meaning(quantity, unit, rank, is_numbered, source)

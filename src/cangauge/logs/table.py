@@ -46,9 +46,9 @@ from cangauge.logs.values import first_text, is_number, numbers_of, read_cells
 
 MAX_COUNTERS: Final = 6
 """Most columns in Ah of which one is looked for that counts the charge [-]."""
-_HOLD_S: Final = 1.0
-"""Longest time that a voltage is held to the next row with a current [s], where rows hold only the
-channels that changed: a bus repeats both within it."""
+HOLD_S: Final = 1.0
+"""Longest time over which a voltage is held or interpolated to a row with a current [s], where each
+channel has times of its own: a bus repeats both within it."""
 _STATES: Final = re.compile(
     r"(?<![a-z])(?:state|status|md|mode|direction|dir|type|step|command|(?:dis)?charg(?:e|ing))"
     "(?![a-z])|状态|类型"
@@ -311,7 +311,7 @@ def _hold_changes(draft: DraftLog) -> None:
         return
     rows = _latest(time + voltage, at)
     age_s = time[at] - time[rows]
-    is_near = (rows <= at) & (age_s <= _HOLD_S)
+    is_near = (rows <= at) & (age_s <= HOLD_S)
     if np.mean(is_near) < 0.5:
         return
     at, rows, age_s = at[is_near], rows[is_near], age_s[is_near]

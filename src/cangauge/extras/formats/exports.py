@@ -229,7 +229,7 @@ def _take_pair(
             draft.sign_by = "data"
 
 
-_DRIVING: Final = REQUIRED[1:3]
+_DRIVING: Final = ("current_a", "voltage_v")
 _CAN: Final = "car's CAN"
 # D3's channels, the preferred first: instruments before copies from CAN.
 _INSTRUMENTS: Final = {

@@ -17,10 +17,8 @@ from cangauge.errors import InputError
 from cangauge.extras.formats.channels import Channels
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.table import HOLD_S
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
-
-VOLTAGE_FILL_S: Final = 1.0
-"""Longest time between two values of a channel for interpolation [s], as in captures."""
 
 
 class Mf4Signals(Channels):
@@ -79,7 +77,7 @@ class Mf4Signals(Channels):
         filled = np.interp(rows_s, own_s, values, left=np.nan, right=np.nan)
         before = own_s[np.clip(right - 1, 0, own_s.size - 1)]
         after = own_s[np.clip(right, 0, own_s.size - 1)]
-        filled[(after - before > VOLTAGE_FILL_S) & (before != rows_s)] = np.nan
+        filled[(after - before > HOLD_S) & (before != rows_s)] = np.nan
         return filled
 
     @classmethod

@@ -33,10 +33,8 @@ _CAN, _SLL, _SLL2 = 227, 113, 276
 _ARPHRD_CAN: Final = 280
 _SLL_CAN, _SLL_CAN_FD = 0x000C, 0x000D
 _OUTGOING: Final = 4
-_MAX_PACKET: Final = 256 * 1024
-"""Largest snapshot length of libpcap [bytes]."""
 _MAX_BLOCK: Final = 1024 * 1024
-"""Largest block of a PCAPNG file that is read [bytes]."""
+"""Largest packet or block that is read [bytes]: libpcap keeps 256 kB of a packet."""
 _FDF, _XL = 0x04, 0x80
 """Bits that mark a frame of CAN FD in its flags, and one of CAN XL in its fifth byte."""
 
@@ -102,7 +100,7 @@ class PcapReader(CaptureReader, BinaryIOMessageReader):
         while start := self.raw.read(1):
             self._place += 1
             seconds, ticks, size, _ = header.unpack(start + self._exactly(header.size - 1))
-            if size > _MAX_PACKET:
+            if size > _MAX_BLOCK:
                 raise ValueError(f"a packet of {size} bytes before byte {self._place}")
             yield interface, seconds + ticks / ticks_per_s, self._exactly(size)
 
