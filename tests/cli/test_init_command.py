@@ -114,6 +114,15 @@ def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path
     assert "the data fit as well: " in (tmp_path / "car.toml").read_text(encoding="utf-8")
 
 
+def test_what_is_not_there_cannot_be_chosen(mitsubishi: Path, tmp_path: Path) -> None:
+    given = ("init", mitsubishi, "-o", tmp_path / "car")
+    refused(in_process(*given, "--choose", "current=9"), "there are 3 candidates")
+    refused(in_process(*given, "--interface", "virtual"), "omit one")
+    error = in_process(*given, "--json").json["error"]
+    assert "current: 1) 0x373 23|16@0+, 2) " in error["message"]
+    assert not (tmp_path / "car").exists()
+
+
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
     refused(in_process("init", "-o", tmp_path), "give a capture")
     assert in_process("init", "x.log").code == 2
