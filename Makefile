@@ -15,7 +15,7 @@ help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
 	@echo "make socketcan the tests that need a real SocketCAN interface"
-	@echo "make nightly   what is too long for the suite (PART=inputs|faults|grade|suite|tests|lowest|long|load|vcan, DATA=FOLDER)"
+	@echo "make nightly   what is too long for the suite (PART=inputs|process|faults|grade|suite|tests|lowest|long|load|vcan, DATA=FOLDER)"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"

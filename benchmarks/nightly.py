@@ -3,6 +3,7 @@
     python benchmarks/nightly.py [PART…] [--data FOLDER] [--socketcan COMMAND]
 
 inputs   the tests of `tests/nightly`: any frames on the bus, damaged files, wrong use of commands
+process  the service as a process: killed, stopped for ten minutes, disk or memory full, clock set
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
@@ -12,7 +13,8 @@ lowest   the lowest versions that pyproject.toml allows
 long     restarts by SIGKILL; load, timing and memory of the service; attacks on its page, status
          and MQTT
 load     half an hour at 12,000 frames/s, or what a bare loop carries here: no loss, memory flat
-vcan     ten minutes of the same on a real vcan0, directly or in a guest (needs --socketcan)
+vcan     ten minutes of the same on a real vcan0, and the gateway as a process, directly or in a
+         guest (needs --socketcan)
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
 last lines of each of its commands. Exit status 1 if a part failed.
@@ -39,6 +41,8 @@ OWN_GAUGE = (
     "run --interface {interface} --channel {channel} --bus-option port={port} -m {model}"
     " --initial-soc {soc} --time-source replay-clock"
 )
+PROCESSES = "tests/nightly/test_whole_processes.py"
+GATEWAY = "-m socketcan tests/nightly/test_gateway_process.py"
 VCAN = "--interface socketcan --channel vcan0 --minutes 10 --bare-minutes 1 --highest 12000"
 LOAD = "--only loss --wanted 0.05 --highest 12000 --minutes 29 --bare-minutes 1"
 
@@ -55,7 +59,8 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
     )
     missing = "no folder of recorded logs: --data FOLDER"
     return {
-        "inputs": [[python, "-m", "pytest", "tests/nightly"]],
+        "inputs": [[python, "-m", "pytest", "tests/nightly", f"--ignore={PROCESSES}"]],
+        "process": [[python, "-m", "pytest", PROCESSES]],
         "faults": [[python, "-m", "faults", *bus]],
         "grade": [
             [python, "-m", "packs", "--data", str(data)],
@@ -99,6 +104,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
         ],
         "vcan": [
             [*socketcan.split(), python, "benchmarks/latency.py", *VCAN.split()],
+            [*socketcan.split(), python, "-m", "pytest", *GATEWAY.split()],
         ]
         if socketcan
         else "no command that provides SocketCAN: --socketcan COMMAND",

@@ -118,7 +118,7 @@ def test_gateway(fault: str, tmp_path: Path) -> None:
             try:
                 waits(lambda: life.process.poll() is not None or len(battery.soc_pct) > begun + 9)  # noqa: B023
                 if life.process.poll() is not None:
-                    assert fault == "memory"
+                    assert fault == "memory", life.text
                     assert len(errors(life.text)) == 1, life.text
                     ended += 1
                     continue

@@ -210,16 +210,16 @@ def _saved_s(folder: Path) -> float:
 def test_clock(off_s: float, tmp_path: Path) -> None:
     for seed in range(SEEDS):
         folder = tmp_path / str(seed)
-        with Battery(40, DRIVE[150 + 10 * seed :], 0.1, is_replay=False) as battery:
+        with Battery(40, DRIVE[150 + 10 * seed :], 1.0, is_replay=False) as battery:
             write_state(folder / "cangauge-state.json", battery.address, seed)
             before = (folder / "cangauge-state.json").read_bytes()
-            life = Life(battery.address, folder, code=SHIFT.format(off_s))
+            life = Life(battery.address, folder, code=SHIFT.format(off_s), max_gap_s="60.0")
             battery.wait(20)
-            assert life.end() == 0
             if off_s == 0.0:
-                assert Status.VALID in battery.statuses(0)
+                assert waits(lambda: Status.VALID in battery.statuses(0), 120.0), life.text
             else:
                 assert Status.VALID not in battery.statuses(0)
+            assert life.end() == 0
             words = "of unknown age" if off_s < 0.0 else "state.restored"
             if off_s > 86400.0:
                 words = "state.refused"
@@ -234,12 +234,11 @@ def test_stopped(tmp_path: Path) -> None:
         lives = []
         for seed in range(SEEDS):
             drive = DRIVE[150 + 10 * seed :]
-            battery = stack.enter_context(Battery(60 + seed, drive, 0.2, is_replay=False))
+            battery = stack.enter_context(Battery(60 + seed, drive, 1.0, is_replay=False))
             write_state(tmp_path / str(seed) / "cangauge-state.json", battery.address, seed)
-            life = Life(battery.address, tmp_path / str(seed))
+            life = Life(battery.address, tmp_path / str(seed), max_gap_s="60.0")
             stack.callback(life.process.kill)
-            battery.wait(20)
-            assert Status.VALID in battery.statuses(0)
+            assert waits(lambda: Status.VALID in battery.statuses(0), 120.0), life.text  # noqa: B023
             time.sleep(random.uniform(0.0, 1.0))
             life.process.send_signal(signal.SIGSTOP)
             lives.append((life, battery))
@@ -251,7 +250,7 @@ def test_stopped(tmp_path: Path) -> None:
             battery.wait(30)
             again = battery.estimates[since:]
             valid = [each for each in again if each["status"] == Status.VALID]
-            assert all(each["age_s"] < 1.0 for each in valid), valid
+            assert all(each["age_s"] <= 2.0 for each in valid), valid
             assert life.end() == 0
             assert clean(life.text), life.text
             assert read_state(tmp_path / life.log.stem / "cangauge-state.json").saved_s >= 0.0
