@@ -139,10 +139,13 @@ def test_kill(tmp_path: Path) -> None:
     random, folder = Random(0), tmp_path / "life"  # noqa: S311 - repeatable
     logs = 0
     with Battery(0, DRIVE, 0.006, is_replay=True) as battery:
-        for _ in range(SEEDS):
+        for seed in range(SEEDS):
+            newest = stored_logs(folder / "judge")[-1:]
             life = Life(battery.address, folder, **REPLAY)
             battery.wait()
-            time.sleep(random.uniform(0.0, 6.0))
+            if seed % 4 == 3:  # a life in which a log is stored, and judged
+                assert waits(lambda: stored_logs(folder / "judge")[-1:] != newest)  # noqa: B023
+            time.sleep(random.uniform(0.0, 2.0))
             life.end(signal.SIGKILL)
             now, frames = check_saved(folder)
             assert now >= min(logs, 4)
