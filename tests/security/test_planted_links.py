@@ -19,6 +19,7 @@ from cangauge.logs.canonical import write_log
 from cangauge.service.lifecycle import sole_writer
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.state import StateKeeper, read_state
+from cangauge.service.status_client import StatusSocket
 from live import frames_of, in_process, leaf_model, leaf_model_path, short_log
 
 fcntl = pytest.importorskip("fcntl")
@@ -154,6 +155,15 @@ def test_no_folder_is_made_through_a_planted_link(shared: Path, tmp_path: Path) 
     ended = in_process("export-c", "-m", leaf_model_path(), "-o", shared / "out" / "deep")
     assert ended.code == 2
     assert "out is a link of another user" in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_folder_of_a_status_socket_is_made_through_a_planted_link(
+    shared: Path, tmp_path: Path
+) -> None:
+    planted(shared / "out", tmp_path)
+    with pytest.raises(InputError, match="out is a link of another user"):
+        StatusSocket(shared / "out" / "deep" / "s.sock", dict)
     assert list(tmp_path.iterdir()) == []
 
 

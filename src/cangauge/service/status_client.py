@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
+from cangauge._files import written_name
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.worker import start_thread
@@ -135,6 +136,7 @@ class StatusSocket:
         try:
             if not hasattr(socket, "AF_UNIX"):
                 raise OSError("this system has no unix sockets in Python")  # noqa: TRY301 - as below
+            written_name(path)  # not through a link of another user
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             if path.parent in runtime_folders() and _is_anothers(path.parent):
                 raise OSError("another user has made its folder")  # noqa: TRY301 - as below
