@@ -75,12 +75,13 @@ class Battery(threading.Thread):
             for frame in encoder.encode(sample._replace(time_s=due_s)):
                 self._send(frame.arbitration_id, bytes(frame.data))
             self._send(0x355, struct.pack("<2H", OWN_PCT, 99))
-            self._send(0x351, struct.pack("<d", time.monotonic()))
+            self._send(0x351, struct.pack("<d", time.time()))
             due_s += EVERY_S
             while not self._over.is_set() and (left_s := due_s - time.monotonic()) > 0.0:
                 message = self._inverter.recv(left_s)
                 if message is not None and message.arbitration_id == 0x351:
-                    self.late_s.append(time.monotonic() - struct.unpack("<d", message.data)[0])
+                    # By the kernel's stamp: this thread may read late.
+                    self.late_s.append(message.timestamp - struct.unpack("<d", message.data)[0])
                 elif message is not None and message.arbitration_id == 0x355:
                     self.soc_pct.append(struct.unpack_from("<H", message.data)[0])
             if self._over.is_set():

@@ -165,11 +165,12 @@ def disk(folder: Path, size_kb: int) -> Iterator[Callable[[str], object]]:
     """Mount a small disk; yield what remounts it with other options."""
     folder.mkdir(exist_ok=True)
 
-    def mount(options: str) -> None:
+    def mount(options: str) -> bool:
         kind = ["-t", "tmpfs"] if not os.path.ismount(folder) else []
-        subprocess.run(["mount", *kind, "-o", options, "tmpfs", folder], check=True)
+        command = ["mount", *kind, "-o", options, "tmpfs", folder]
+        return subprocess.run(command, check=False, capture_output=True).returncode == 0
 
-    mount(f"size={size_kb}k")
+    assert mount(f"size={size_kb}k")
     try:
         yield mount
     finally:
@@ -183,21 +184,23 @@ def test_disk(fault: str, tmp_path: Path) -> None:
     for seed in range(SEEDS):
         folder = tmp_path / str(seed)
         size_kb = random.randrange(80, 900) if fault == "full" else 20_000
+        # A disk on which a recording is open cannot become read-only.
+        keys = {key: text for key, text in REPLAY.items() if fault == "full" or "record" not in key}
         with (
             disk(folder, size_kb) as mount,
             Battery(20, DRIVE, 0.006, is_replay=True) as battery,
         ):
-            life = Life(battery.address, folder, **REPLAY)
+            life = Life(battery.address, folder, **keys)
             battery.wait(20)
             time.sleep(random.uniform(0.0, 2.0))
             if fault == "read-only":
-                mount("remount,ro")
+                assert waits(lambda: mount("remount,ro"))
             words = {"full": "free some space", "read-only": "read-only"}[fault]
             assert waits(lambda: words in life.text.lower(), 60.0), life.text  # noqa: B023
             battery.wait(20)  # it goes on
             check_saved(folder)
             saved_s = _saved_s(folder)
-            mount("remount,rw,size=20000k")
+            assert mount("remount,rw,size=20000k")
             assert waits(lambda: _saved_s(folder) > saved_s, 60.0), life.text  # noqa: B023
             assert life.end() == 0
             check_saved(folder)
