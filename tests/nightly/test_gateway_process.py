@@ -115,8 +115,7 @@ def test_gateway(fault: str, tmp_path: Path) -> None:
             elif fault == "memory":
                 code = LIMIT.format(random.randrange(260, 420) << 20)
             begun = len(battery.soc_pct)
-            life = gateway(battery, folder, code)
-            try:
+            with gateway(battery, folder, code) as life:
                 waits(lambda: life.process.poll() is not None or len(battery.soc_pct) > begun + 9)  # noqa: B023
                 if life.process.poll() is not None:
                     assert fault == "memory", life.text
@@ -142,8 +141,5 @@ def test_gateway(fault: str, tmp_path: Path) -> None:
                 if fault != "kill":
                     assert life.end() == 0
                 assert clean(life.text), life.text
-            finally:
-                life.process.kill()
-                life.process.wait()
         assert max(battery.late_s) < DOUBT_S + 0.3
     assert ended > 0 or fault != "memory"

@@ -141,19 +141,19 @@ def test_kill(tmp_path: Path) -> None:
     with Battery(0, DRIVE, 0.006, is_replay=True) as battery:
         for seed in range(SEEDS):
             newest = stored_logs(folder / "judge")[-1:]
-            life = Life(battery.address, folder, **REPLAY)
+            with Life(battery.address, folder, **REPLAY) as life:
+                battery.wait()
+                if seed % 4 == 3:  # a life in which a log is stored, and judged
+                    assert waits(lambda: stored_logs(folder / "judge")[-1:] != newest)  # noqa: B023
+                time.sleep(random.uniform(0.0, 2.0))
+                life.end(signal.SIGKILL)
+                now, frames = check_saved(folder)
+                assert now >= min(logs, 4)
+                assert frames > 0
+                logs = now
+        with Life(battery.address, folder, **REPLAY) as life:
             battery.wait()
-            if seed % 4 == 3:  # a life in which a log is stored, and judged
-                assert waits(lambda: stored_logs(folder / "judge")[-1:] != newest)  # noqa: B023
-            time.sleep(random.uniform(0.0, 2.0))
-            life.end(signal.SIGKILL)
-            now, frames = check_saved(folder)
-            assert now >= min(logs, 4)
-            assert frames > 0
-            logs = now
-        life = Life(battery.address, folder, **REPLAY)
-        battery.wait()
-        assert life.end() == 0
+            assert life.end() == 0
     assert logs > 1
     assert clean(life.text)
     assert life.text.count("state.restored") == SEEDS
@@ -189,8 +189,8 @@ def test_disk(fault: str, tmp_path: Path) -> None:
         with (
             disk(folder, size_kb) as mount,
             Battery(20, DRIVE, 0.006, is_replay=True) as battery,
+            Life(battery.address, folder, **keys) as life,
         ):
-            life = Life(battery.address, folder, **keys)
             battery.wait(20)
             time.sleep(random.uniform(0.0, 2.0))
             if fault == "read-only":
@@ -219,19 +219,19 @@ def test_clock(off_s: float, tmp_path: Path) -> None:
         with Battery(40, DRIVE[150 + 10 * seed :], 1.0, is_replay=False) as battery:
             write_state(folder / "cangauge-state.json", battery.address, seed)
             before = (folder / "cangauge-state.json").read_bytes()
-            life = Life(battery.address, folder, code=SHIFT.format(off_s), max_gap_s="60.0")
-            battery.wait(20)
-            if off_s == 0.0:
-                assert waits(lambda: Status.VALID in battery.statuses(0), 120.0), life.text
-            else:
-                assert Status.VALID not in battery.statuses(0)
-            assert life.end() == 0
-            words = "of unknown age" if off_s < 0.0 else "state.restored"
-            if off_s > 86400.0:
-                words = "state.refused"
-                assert (folder / "cangauge-state.json.refused").read_bytes() == before
-            assert words in life.text
-            assert clean(life.text), life.text
+            with Life(battery.address, folder, code=SHIFT.format(off_s), max_gap_s="60.0") as life:
+                battery.wait(20)
+                if off_s == 0.0:
+                    assert waits(lambda: Status.VALID in battery.statuses(0), 120.0), life.text
+                else:
+                    assert Status.VALID not in battery.statuses(0)
+                assert life.end() == 0
+                words = "of unknown age" if off_s < 0.0 else "state.restored"
+                if off_s > 86400.0:
+                    words = "state.refused"
+                    assert (folder / "cangauge-state.json.refused").read_bytes() == before
+                assert words in life.text
+                assert clean(life.text), life.text
 
 
 def test_stopped(tmp_path: Path) -> None:
@@ -242,8 +242,9 @@ def test_stopped(tmp_path: Path) -> None:
             drive = DRIVE[150 + 10 * seed :]
             battery = stack.enter_context(Battery(60 + seed, drive, 1.0, is_replay=False))
             write_state(tmp_path / str(seed) / "cangauge-state.json", battery.address, seed)
-            life = Life(battery.address, tmp_path / str(seed), max_gap_s="60.0")
-            stack.callback(life.process.kill)
+            life = stack.enter_context(
+                Life(battery.address, tmp_path / str(seed), max_gap_s="60.0")
+            )
             assert waits(lambda: Status.VALID in battery.statuses(0), 120.0), life.text  # noqa: B023
             time.sleep(random.uniform(0.0, 1.0))
             life.process.send_signal(signal.SIGSTOP)
@@ -268,20 +269,20 @@ def test_memory_limit(tmp_path: Path) -> None:
         folder = tmp_path / str(seed)
         with Battery(90, DRIVE, 0.006, is_replay=True) as battery:
             size = random.randrange(300, 1500) << 20
-            life = Life(battery.address, folder, code=LIMIT.format(size), **REPLAY)
-            came = waits(lambda: life.process.poll() is not None or len(battery.estimates) > 20)  # noqa: B023
-            assert came
-            if life.process.poll() is None:
-                started += 1
-                life.process.send_signal(signal.SIGHUP)
-                battery.wait(30)
-                assert life.process.poll() is None, life.text
-                assert life.end() == 0
-            else:
-                refused += 1
-                assert life.process.returncode > 0
-                assert len(errors(life.text)) == 1, life.text
-            assert clean(life.text), life.text
-            check_saved(folder)
+            with Life(battery.address, folder, code=LIMIT.format(size), **REPLAY) as life:
+                came = waits(lambda: life.process.poll() is not None or len(battery.estimates) > 20)
+                assert came
+                if life.process.poll() is None:
+                    started += 1
+                    life.process.send_signal(signal.SIGHUP)
+                    battery.wait(30)
+                    assert life.process.poll() is None, life.text
+                    assert life.end() == 0
+                else:
+                    refused += 1
+                    assert life.process.returncode > 0
+                    assert len(errors(life.text)) == 1, life.text
+                assert clean(life.text), life.text
+                check_saved(folder)
     assert started
     assert refused

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Self
 
 from cangauge.bus.open import BusAddress
 from cangauge.bus.vehicle import Vehicle
@@ -65,6 +66,13 @@ class Life:
                 stderr=stderr,
                 stdout=subprocess.DEVNULL,
             )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
 
     @property
     def text(self) -> str:
