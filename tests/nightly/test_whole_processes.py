@@ -161,20 +161,24 @@ def test_kill(tmp_path: Path) -> None:
 
 
 @contextmanager
-def disk(folder: Path, size_kb: int) -> Iterator[Callable[[str], object]]:
-    """Mount a small disk; yield what remounts it with other options."""
-    folder.mkdir(exist_ok=True)
-
-    def mount(options: str) -> bool:
-        kind = ["-t", "tmpfs"] if not os.path.ismount(folder) else []
-        command = ["mount", *kind, "-o", options, "tmpfs", folder]
-        return subprocess.run(command, check=False, capture_output=True).returncode == 0
-
-    assert mount(f"size={size_kb}k")
+def full_disk(folder: Path, size_kb: int) -> Iterator[Callable[[], object]]:
+    """Mount a small disk; yield what makes it large."""
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_kb}k", "x", folder], check=True)
     try:
-        yield mount
+        yield lambda: subprocess.run(["mount", "-o", "remount,size=20000k", folder], check=True)
     finally:
         subprocess.run(["umount", "-l", folder], check=True)
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[Callable[[], object]]:
+    """Forbid everybody to make, rename or remove files in a folder; yield what allows it again."""
+    subprocess.run(["chattr", "+i", folder], check=True)
+    try:
+        yield lambda: subprocess.run(["chattr", "-i", folder], check=True)
+    finally:
+        subprocess.run(["chattr", "-i", folder], check=True)
 
 
 @as_root
@@ -182,25 +186,21 @@ def disk(folder: Path, size_kb: int) -> Iterator[Callable[[str], object]]:
 def test_disk(fault: str, tmp_path: Path) -> None:
     random = Random(1)  # noqa: S311 - repeatable
     for seed in range(SEEDS):
-        folder = tmp_path / str(seed)
-        size_kb = random.randrange(80, 900) if fault == "full" else 20_000
-        # A disk on which a recording is open cannot become read-only.
-        keys = {key: text for key, text in REPLAY.items() if fault == "full" or "record" not in key}
-        with (
-            disk(folder, size_kb) as mount,
-            Battery(20, DRIVE, 0.006, is_replay=True) as battery,
-            Life(battery.address, folder, **keys) as life,
-        ):
+        folder, words = tmp_path / str(seed), "free some space"
+        with ExitStack() as stack:
+            if fault == "full":
+                mend = stack.enter_context(full_disk(folder, random.randrange(80, 900)))
+            battery = stack.enter_context(Battery(20, DRIVE, 0.006, is_replay=True))
+            life = stack.enter_context(Life(battery.address, folder, **REPLAY))
             battery.wait(20)
             time.sleep(random.uniform(0.0, 2.0))
             if fault == "read-only":
-                assert waits(lambda: mount("remount,ro"))
-            words = {"full": "free some space", "read-only": "read-only"}[fault]
-            assert waits(lambda: words in life.text.lower(), 60.0), life.text  # noqa: B023
+                mend, words = stack.enter_context(read_only(folder)), "not writable"
+            assert waits(lambda: words in life.text, 60.0), life.text  # noqa: B023
             battery.wait(20)  # it goes on
             check_saved(folder)
             saved_s = _saved_s(folder)
-            assert mount("remount,rw,size=20000k")
+            mend()
             assert waits(lambda: _saved_s(folder) > saved_s, 60.0), life.text  # noqa: B023
             assert life.end() == 0
             check_saved(folder)
