@@ -230,12 +230,13 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     code = cause.errno if isinstance(cause, OSError) else None
     interface, channel = address.interface, address.channel
     reason = " ".join(str(cause).split()) or type(cause).__name__
-    kind, of_interface = InputError, False
+    kind, field, value = InputError, "--channel", channel
     if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
-        problem, of_interface = "this machine has no SocketCAN", True
+        problem, field, value = "this machine has no SocketCAN", "--interface", interface
         cure = "use another interface, e.g. --interface udp_multicast"
     elif code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
-        problem, of_interface = "no network interface of this machine carries multicast", True
+        problem = "no network interface of this machine carries multicast"
+        field, value = "--interface", interface
         cure = "bring a network interface up, or use SocketCAN"
     elif code == errno.ENETDOWN:
         problem, cure = "this bus is down", f"bring it up: sudo ip link set {channel} up"
@@ -250,7 +251,7 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     elif isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError) or any(
         word in reason for word in ("library", "module", "install")
     ):
-        kind, of_interface = DriverMissingError, True
+        kind, field, value = DriverMissingError, "--interface", interface
         problem = f"a library for this interface is missing ({reason})"
         cure = f"install the library that python-can's documentation names for {interface}"
         if interface == "udp_multicast":
@@ -258,8 +259,7 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     else:
         problem = f"{interface} cannot open this bus ({reason})"
         cure = "check channel and --bus-option"
-    name, value = ("--interface", interface) if of_interface else ("--channel", channel)
-    return kind(problem, field=name, value=value, cure=cure)
+    return kind(problem, field=field, value=value, cure=cure)
 
 
 def _cure_of_missing(channel: str) -> str:

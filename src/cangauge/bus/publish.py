@@ -187,7 +187,7 @@ class SocPublisher:
         The grid is a new one after a pause, and in a new log, which begins earlier.
         """
         every_s, due_s = periods * ESTIMATE_EVERY_S, self._due_s[periods]
-        if not (now_s >= due_s - EARLY_S or now_s < due_s - every_s - EARLY_S):
+        if due_s - every_s - EARLY_S <= now_s < due_s - EARLY_S:
             return False
         is_on_grid = due_s - EARLY_S <= now_s < due_s + every_s
         self._due_s[periods] = every_s + (due_s if is_on_grid else now_s)
@@ -225,8 +225,10 @@ class SocPublisher:
         """Return SOC_HEALTH, SOC_POWER and, where there are cells, SOC_CELLS."""
         health = report.health._asdict() | {"current_offset_a": report.health.offset_a}
         power = report.power._asdict()
-        power["energy_kwh"] = 1e-3 * report.power.energy_wh
-        power["energy_std_kwh"] = 1e-3 * report.power.energy_std_wh
+        power |= {
+            "energy_kwh": 1e-3 * power["energy_wh"],
+            "energy_std_kwh": 1e-3 * power["energy_std_wh"],
+        }
         frames = [self._frame("soc_health", health), self._frame("soc_power", power)]
         if (cells := report.cells) is not None:
             values = {

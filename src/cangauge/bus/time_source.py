@@ -261,14 +261,12 @@ def frames_of_buses(
     Each bus has its own time: stamps of two buses can be of two adapters. `open_bus` makes one by
     its time source; `buses` holds them by channel, and is emptied where a replay begins.
     """
-    source: TimeSourceName = "receive"
-    is_known = False
+    source: TimeSourceName | None = None
     for message in messages:
-        if not is_known and is_clock(message, clock_id):
-            is_known = True
+        if source is None and is_clock(message, clock_id):
             source = recorded_time_source([message], clock_id)
             if source == "replay-clock":
                 buses.clear()
         if message.channel not in buses:
-            buses[message.channel] = open_bus(source)
+            buses[message.channel] = open_bus(source or "receive")
         yield buses[message.channel], message
