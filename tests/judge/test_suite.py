@@ -45,6 +45,18 @@ def test_a_counter_has_the_errors_of_its_faults(drive: Drive) -> None:
     assert none["silent"] == 0.0
 
 
+def test_the_card_has_a_row_for_each_fault(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite, "simulated_drives", lambda: [drive])
+    wanted = [FAULT["none"], FAULT["start -20 %"]]
+    monkeypatch.setattr(suite.run_suite, "__defaults__", (wanted, print))
+    card = in_process("judge", "--suite", "--", *COUNTER)
+    none, start = (
+        line.split() for line in card.out.splitlines() if "none" in line or "-20" in line
+    )
+    assert (none[0], none[-2:]) == ("none", ["–", "0"])
+    assert "never" in start
+
+
 def test_a_filter_recovers_and_states_its_error(drive: Drive) -> None:
     none, start = run_suite(FILTER, [drive], [FAULT["none"], FAULT["start -20 %"]])
     assert none["mae_pct"] < 3.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -149,7 +150,6 @@ def _suite(
             else recorded_drives(sorted(data.iterdir()), Model.load(model))
         )
         scores = run_suite(started_by, drives, show=show)
-    # Heading: score, scale and decimals.
     columns = {
         "MAE [%]": ("mae_pct", 1.0, 2),
         "worst [%]": ("worst_pct", 1.0, 1),
@@ -160,13 +160,11 @@ def _suite(
     }
     head, rows = ["fault", *columns], []
     for score in scores:
-        values = [(score[key], scale, digits) for key, scale, digits in columns.values()]
-        rows.append(
-            [
-                score["fault"],
-                *(number(value and scale * value, digits) for value, scale, digits in values),
-            ]
-        )
+        row = [score["fault"]]
+        for name, scale, digits in columns.values():
+            value = score[name]
+            row.append("never" if value == math.inf else number(value and scale * value, digits))
+        rows.append(row)
     result = {"schema": 1, "gauge": " ".join(started_by), "scores": scores}
     finish(result, partial(print_table, f"{len(drives)} drives", head, rows), as_json=json_output)
 
