@@ -18,6 +18,7 @@ from cangauge.identify.effect_search import (
     parse_effect_ids,
 )
 from cangauge.identify.fit import fit
+from cangauge.identify.least_squares import N
 from cangauge.identify.rows import fit_rows
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
@@ -113,6 +114,36 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
             assert found == pytest.approx(change, abs=1e-6 + 1e-6 * np.abs(change).max())
             column += 1
     assert column == count
+
+
+def test_a_resistance_acts_through_the_effects_that_scale_its_drop() -> None:
+    log = trips(1)[0]
+    rows, start = fit_rows(log, CAPACITY_AH, low_pass_s=()), log.first_soc()
+    assert start is not None
+    [item] = [
+        each
+        for each in offered(["resistance_soc"], BASE)
+        if each.shape["delayed"] == 1.0 and each.shape["width_pct"] == 40.0
+    ]
+    about, step_ohm = np.array([0.8, 0.4]), 1e-3
+
+    def model(first_ohm: float) -> ExtendedModel:
+        ohm = (first_ohm, *CELLS.loads.resistance_ohm[1:])
+        loads = CELLS.loads.model_copy(update={"resistance_ohm": ohm})
+        changed = ExtendedModel(replace(CELLS, loads=loads), CAPACITY_AH)
+        return changed.with_effect(item.effect, item.values(about))
+
+    def voltage_v(first_ohm: float) -> np.ndarray:
+        row, soc_pct = start
+        return (
+            model(first_ohm).predict(Signals.of(log), soc_pct, rows.at, initial_row=row).voltage_v
+        )
+
+    now_ohm = CELLS.loads.resistance_ohm[0]
+    by_ohm = (voltage_v(now_ohm + step_ohm) - voltage_v(now_ohm)) / step_ohm
+    found = linearize(model(now_ohm), rows, Selected((item,)), about).features[:, N + 1]
+    assert found == pytest.approx(by_ohm, abs=1e-6 * np.abs(by_ohm).max())
+    assert not np.allclose(found, rows.current_a, rtol=0.01)
 
 
 def test_columns_of_the_equation_are_not_offered() -> None:

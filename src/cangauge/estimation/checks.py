@@ -55,8 +55,8 @@ class Limits(NamedTuple):
     residual_at_most: float
     """Largest residual of one row over its standard deviation."""
     strain_at_most: float
-    """Largest `SocFilter.strain`: its mean under the model, less where the logs of the fit stayed
-    below it."""
+    """Largest `SocFilter.strain`: its mean under the model, times the relative strain of the
+    left-out logs of the fit."""
 
     @classmethod
     def of(cls, model: OnlineModel) -> Limits:

@@ -49,7 +49,7 @@ OFFSET_STD_A: Final = 1.0
 
 LEVEL_TIME_S: Final = 4.0 * 3600.0
 """Time constant of the voltage error that lasts a drive [s]. From 4 to 24 h all are better than
-none on development months; the shortest is the least sure of itself."""
+none on development months. The shortest forgets soonest, and states the largest uncertainty."""
 
 FUNCTIONS_TIME_S: Final = 72.0 * 3600.0
 """Time constant of the functions [s]: temperature and use of a car change within days, and with

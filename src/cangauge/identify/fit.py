@@ -135,6 +135,8 @@ def fit(
     _check_logs(recorded)
     stated_pct = given_starts(initial_soc_pct, len(recorded))
     capacity_ah = _capacity_of(recorded, stated_pct, capacity_ah)
+    unstated = [log for log, start in zip(recorded, stated_pct, strict=True) if start is None]
+    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
     effect_ids = _effect_ids(effects, equation)
     chemistry, remark = _chemistry_of(recorded, stated_pct, chemistry, cells, capacity_ah)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
@@ -144,6 +146,7 @@ def fit(
         on_logs = remarks_on_logs(starts, recorded, delay_s, capacity_ah)  # before rows need memory
         delays = DELAYS_S if equation == "knots" else usable_delays(known, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in known]
+        _check_rows(rows)
         options = {
             "capacity_ah": capacity_ah,
             "rate_hz": rate_hz,
@@ -226,8 +229,7 @@ def _capacity_of(
     Raises
     ------
     InputError
-        If the capacity is not positive, or charge and SoC of a log without a stated start
-        contradict each other.
+        If the capacity is not positive.
     """
     if stated is None:
         capacity_ah = capacity_from_full_discharge(logs, starts_pct)
@@ -242,8 +244,6 @@ def _capacity_of(
             value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )
-    unstated = [log for log, start in zip(logs, starts_pct, strict=True) if start is None]
-    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
     return capacity_ah
 
 
@@ -259,8 +259,8 @@ def _effect_ids(effects: str | Sequence[str] | None, equation: Equation) -> tupl
     return ids
 
 
-def _made_of(rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
-    """Return how a model was made; raise InputError if the logs have too few rows for one."""
+def _check_rows(rows: Sequence[FitRows]) -> None:
+    """Raise InputError if the logs have too few rows for a model."""
     if (number := sum(map(len, rows))) < LEAST_ROWS:
         raise InputError(
             f"only {number} rows can be used, and a fit needs {LEAST_ROWS}",
@@ -268,6 +268,10 @@ def _made_of(rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
             cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
             " lists what a log can identify",
         )
+
+
+def _made_of(rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
+    """Return how a model was made."""
     logs = [SourceLog(name=item.name, rows=len(item), sha256=log_sha256(item.log)) for item in rows]
     fingerprint = text_sha256("".join(log.sha256 for log in logs))
     return Made(by=f"cangauge {__version__}", options=options, logs=logs, fingerprint=fingerprint)

@@ -119,7 +119,7 @@ class PublishedFit:
     coefficients : array of shape (p,)
         k0 … k7 [V], kt [V/K], R1 … Rn [Ω].
     covariance : array of shape (p, p)
-        Theirs; rows of a minute count as one.
+        Of the coefficients; 60 s of rows count together as one.
     residual_v : float
         Rms residual [V].
     condition_number : float
