@@ -109,10 +109,10 @@ class Lag:
         return [] if self._last is None else [*self._last]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is none."""
+        """Continue from a saved state; raise ValueError if it is of something else."""
         self._last = None
         if state:
-            time_s, latest, value = finite(state)
+            time_s, latest, value = state
             self._last = time_s, latest, value
 
 
@@ -151,17 +151,10 @@ class First:
         return [] if self._first_s is None else [self._first_s]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is none."""
+        """Continue from a saved state; raise ValueError if it is of something else."""
         self._first_s = None
         if state:
-            (self._first_s,) = finite(state)
-
-
-def finite(numbers: Sequence[float]) -> Sequence[float]:
-    """Return the numbers; raise ValueError if one is not finite."""
-    if not all(map(math.isfinite, numbers)):
-        raise ValueError("not finite")
-    return numbers
+            (self._first_s,) = state
 
 
 def low_passed(

@@ -24,7 +24,7 @@ from cangauge.model.effects.base import (
     Signals,
     Values,
 )
-from cangauge.model.first_order import Lag, finite
+from cangauge.model.first_order import Lag
 from cangauge.model.voltage_model import VoltageModel
 
 SMOOTHING_S: Final = 200.0
@@ -80,21 +80,15 @@ class _Waiting:
         return Signals(time_s, skewed, voltage_v, temperature_c)
 
     def state(self) -> list[float]:
-        waiting = self._waiting.T.ravel().tolist()
-        return [float(self._waiting.shape[1]), *waiting, *self._currents.ravel().tolist()]
+        """Return the number of rows that wait, these, and the currents."""
+        both = (self._waiting, self._currents)
+        return [float(self._waiting.shape[1]), *np.concatenate(both, axis=None).tolist()]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is none."""
-        count = int(*finite(state[:1]))
-        readings = np.array(state[1 : 1 + 4 * count]).reshape(count, 4)
-        currents = np.array(state[1 + 4 * count :]).reshape(2, -1)
-        finite([*readings[:, :2].ravel(), *currents.ravel()])  # the others may be missing
-        waiting_s, times_s = readings[:, 0], currents[0]
-        is_in_order = (np.diff(waiting_s) > 0.0).all() and (np.diff(times_s) > 0.0).all()
-        ends_together = count == 0 or np.array_equal(waiting_s[-1:], times_s[-1:])
-        if np.isinf(readings).any() or not (is_in_order and ends_together):
-            raise ValueError("not readings that wait and their currents")
-        self._waiting, self._currents = readings.T, currents
+        """Continue from a saved state; raise ValueError if it is of something else."""
+        count, *numbers = state
+        waiting, currents = np.split(np.array(numbers), [4 * int(count)])
+        self._waiting, self._currents = waiting.reshape(4, -1), currents.reshape(2, -1)
 
 
 def skewed_current(signals: Signals, _: Values, at: Context) -> Signals:
