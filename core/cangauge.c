@@ -521,24 +521,27 @@ static void watch_sign(const cg_model *model, cg_memory *memory, const cg_sample
     }
 }
 
-/* Compare a current beyond the fit's with the voltage: a false one has no voltage drop. */
+/* Compare a current beyond the fit's with the voltage, which is that of one nearer to the fit's if
+ * it is false. */
 static void confirm_current(cg_estimator *self, const cg_sample *sample, cg_real unseen_v2)
 {
     cg_state *state = &self->state;
     const cg_model *model = self->model;
-    if (!is_outside(sample->current_a, model->current_range_a)) {
+    const bool is_above = sample->current_a > model->current_range_a[1];
+    if (!is_above && !(sample->current_a < model->current_range_a[0])) {
         return;
     }
     cg_passed passed;
-    cg_means row = {0};
     since_filter(state, &passed);
-    row.voltage_v = sample->voltage_v;
-    row.temperature_c = state->memory.temperature_c;
-    row.unseen_v2 = unseen_v2;
-    row.load = state->load;
-    row.drive = state->drive;
+    const cg_means row = {
+        .voltage_v = sample->voltage_v,
+        .temperature_c = state->memory.temperature_c,
+        .unseen_v2 = unseen_v2,
+        .load = state->load,
+        .drive = state->drive,
+    };
     const cg_real left = cg_filter_residual(&state->filter, model, &passed, &row);
-    if (((sample->current_a > R(0.0)) ? left : -left) > model->residual_at_most) {
+    if ((is_above ? left : -left) > model->residual_at_most) {
         state->memory.contradicted_until_s = sample->time_s + cg_span(R(CONTRADICTED_S));
     }
 }

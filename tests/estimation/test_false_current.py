@@ -58,10 +58,14 @@ def test_a_wrong_scale_is_not_valid() -> None:
     assert not np.any(table.status[beyond] == Status.VALID)
 
 
-def test_both_implementations_contradict_the_same_rows() -> None:
-    log, settings = stated(LOG, 500.0), EstimatorSettings(initial_soc_pct=90.0)
-    python = step_all(Estimator(MODEL, settings), samples_of(log))
-    compiled = run_estimator(log, MODEL, settings)
+@pytest.mark.parametrize(
+    ("current_a", "least_a"), [(500.0, -50.0), (-400.0, -50.0), (-300.0, 15.0)]
+)
+def test_both_implementations_contradict_the_same_rows(current_a: float, least_a: float) -> None:
+    model = within(MODEL, least_a, 200.0)
+    log, settings = stated(LOG, current_a), EstimatorSettings(initial_soc_pct=90.0)
+    python = step_all(Estimator(model, settings), samples_of(log))
+    compiled = run_estimator(log, model, settings)
     np.testing.assert_array_equal(compiled.reasons, python.reasons)
     assert np.any(python.reasons & Reason.INNOVATION_LARGE)
 

@@ -303,17 +303,19 @@ class Estimator:
             )
 
     def _confirm_current(self, row: Block, sample: Sample) -> None:
-        """Compare a current beyond the fit's with the voltage: a false one has no voltage drop.
+        """Compare a current beyond the fit's with the voltage, which a false one leaves as it is.
 
-        Only a voltage of a smaller current contradicts it, by more than the model's uncertainty at
-        that current.
+        Only the voltage of a current nearer to the fit's contradicts it, by more than the model's
+        uncertainty at that current.
         """
-        if not _is_outside(sample.current_a, self.voltage_model.range.current_a):
+        low_a, high_a = self.voltage_model.range.current_a
+        is_above = sample.current_a > high_a
+        if not is_above and not sample.current_a < low_a:
             return
         likelier = self.hypotheses.likelier
         soc_pct, _ = likelier.soc_moments_after(*self._counter.since(self._filter_at))
         residual = likelier.row_residual(row, soc_pct)
-        if math.copysign(residual, residual * sample.current_a) > self.limits.residual_at_most:
+        if (residual if is_above else -residual) > self.limits.residual_at_most:
             self._memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
 
     def _close_block(self, time_s: float) -> None:
