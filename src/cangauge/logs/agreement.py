@@ -24,6 +24,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.quantities import LIMITS, QUANTITIES
 from cangauge.logs.resolution import wrapped_current
 from cangauge.logs.sign import SignFinding, SignSource, sign_of_current
+from cangauge.logs.values import typical
 
 _TIME_UNITS: Final = {
     "s": "seconds",
@@ -128,7 +129,7 @@ def _in_canonical_units(
     log: Log, labels: Mapping[str, str], in_seconds: bool | None, stated: Collection[str]
 ) -> Log:
     """Return the log, with a remark on an unusual temperature; InputError for another unit."""
-    usual_v, usual_c = float(np.median(log.voltage_v)), float(np.median(log.temperature_c))
+    usual_v, usual_c = typical(log.voltage_v), typical(log.temperature_c)
     may_be_swapped = COLDEST_C <= usual_v <= LIMITS["unusually_hot_c"]
     label_v, label_c = (labels.get(name, name) for name in ("voltage_v", "temperature_c"))
     table = (
@@ -188,7 +189,7 @@ def _option(columns: Mapping[str, tuple[str, Sequence[str]]]) -> str:
 
 def _of_time(log: Log, in_seconds: bool | None) -> list[_Hypothesis]:
     first, step = float(log.time_s[0]), np.diff(log.time_s)
-    usual = float(np.median(step)) if step.size else 1.0
+    usual = typical(step) if step.size else 1.0
     finer = _fitting(usual, ("ms", "us", "ns"))
     coarser = ["d"] if first > LIMITS["spreadsheet_d"] else _fitting(usual, ("min", "h", "d"))
     looks_finer, looks_coarser = (

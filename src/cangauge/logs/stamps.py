@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.quantities import EPOCHS, LIMITS, unit_of
-from cangauge.logs.values import first_text, is_number, numbers_of, unit_in_cell
+from cangauge.logs.values import first_text, is_number, numbers_of, typical, unit_in_cell
 
 _CLOCK: Final = (
     r"(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
@@ -164,17 +164,16 @@ def _seconds_of_numbers(
         return values * (unit_of("time_s", unit) or (1.0, 0.0))[0], unit
     is_known = np.isfinite(values)
     finite = values[is_known]
-    sample = finite[:: 1 + finite.size // 10_000]
-    typical = float(np.median(sample)) if sample.size else 0.0
+    middle = typical(finite)
     first_s, last_s = LIMITS["can_logs_s"]
     for name, (tick_s, origin_s) in EPOCHS.items():
-        if first_s <= typical * tick_s - origin_s <= last_s:
+        if first_s <= middle * tick_s - origin_s <= last_s:
             ticks = values - origin_s / tick_s  # before scaling: 100 ns of 2000 years need 63 bits
             return ticks * tick_s, f"{name}, from its size"
-    if typical >= 1e11:  # milliseconds, of 1973
+    if middle >= 1e11:  # milliseconds, of 1973
         cure = f"state it: --columns 'time={label}[?]', with s, ms, us, ns, min, h or d for ?"
         problem = "the unit of time is not stated, and no epoch has a year of 1991 to 2099"
-        raise InputError(problem, source=source, field=label, value=typical, cure=cure)
+        raise InputError(problem, source=source, field=label, value=middle, cure=cure)
     steps = np.abs(np.diff(finite))
     if np.any(steps > 40.0) and np.median(steps) < 40.0:
         # A count of seconds has some of 60 to 99 of each hundred; a clock none, and no gap there.

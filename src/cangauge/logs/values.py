@@ -35,6 +35,15 @@ def is_number(text: str) -> bool:
     return True
 
 
+def typical(values: FloatArray) -> float:
+    """Return the median of at most 20,000 evenly spaced values of shape (n,), 0 of none.
+
+    It tells the unit of a column. That of all values takes as long as reading them.
+    """
+    sample = values[:: 1 + values.size // 10_000]
+    return float(np.median(sample)) if sample.size else 0.0
+
+
 def is_text(column: Any) -> bool:
     """Return whether an Arrow column holds text, dictionary-encoded or not."""
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
