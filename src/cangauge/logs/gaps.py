@@ -51,7 +51,8 @@ def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
         Time [s] and current [A], positive = discharge. Steps longer than `bridge_s` count nothing.
     """
     step_s = np.diff(time_s)
-    step_s[step_s > bridge_s(time_s)] = 0.0
+    if np.max(step_s, initial=0.0) > BRIDGE_S:  # else the median of all steps is not needed
+        step_s[step_s > bridge_s(time_s)] = 0.0
     total_ah = np.zeros(time_s.size)
     step_ah = total_ah[1:]  # in place: a log may have millions of rows
     np.add(current_a[1:], current_a[:-1], out=step_ah)
