@@ -304,6 +304,11 @@ def test_a_second_fault_is_named_only_where_both_are_sure(faulty: Diagnosis) -> 
     assert apart.summary.startswith("Most likely the pack voltage reads")
     assert "or the capacity is" not in apart.summary
     assert apart.to_json()["answer"]["stated"] == ["voltage_reading", "capacity"]
+
+
+def test_an_improbable_first_fault_leaves_the_cause_open(faulty: Diagnosis) -> None:
+    found = judged(faulty, voltage_offset=0.4, capacity=0.3, weak_cell=0.2, time_skew=0.1)
+    assert found.summary.startswith("The cause is not clear. Most probable: the pack voltage reads")
     alone = judged(faulty, voltage_offset=0.95, capacity=0.05)
     assert alone.summary.startswith("The pack voltage reads")
 

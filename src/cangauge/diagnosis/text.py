@@ -155,7 +155,9 @@ def _what(found: Diagnosis) -> str:
         sentence(found, found.best_of(fault), found.healthy.model.pack) for fault in posterior.named
     )
     if not posterior.is_sure:
-        first = f"Most likely {_lower(first)}"
+        is_likelier_than_not = posterior.within_gap(posterior.stated[0]) > 0.5
+        begin = "Most likely" if is_likelier_than_not else "The cause is not clear. Most probable:"
+        first = f"{begin} {_lower(first)}"
     what = ", or ".join([first, *map(_lower, others)])
     return f"{what}. Likelihood: {_likeliest(posterior)}{_together(posterior)}.{sure}"
 
