@@ -36,7 +36,7 @@ from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.offline import run_estimator, samples_of, step_all
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.embedded import PERIOD_S, export_c
 from cangauge.identify.fit import fit
@@ -208,11 +208,13 @@ def differing_bits(folder: Path) -> dict[str, dict[str, Any]]:
         numbers = differ = 0
         for log in pack.judged:
             table = run_estimator(log, model, EstimatorSettings())
-            reference = Estimator(model, EstimatorSettings())
-            expected = np.array([reference.step(sample)[1:7] for sample in samples_of(log)])
+            reference = step_all(Estimator(model, EstimatorSettings()), samples_of(log))
             names = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct",
                      "voltage_model_v", "residual_v")  # fmt: skip
-            columns = np.column_stack([getattr(table, name) for name in names])
+            columns, expected = (
+                np.column_stack([getattr(each, name) for name in names])
+                for each in (table, reference)
+            )
             both = np.isclose(columns, expected, rtol=1e-9, atol=1e-9, equal_nan=True)
             numbers += both.size
             differ += int((~both).sum())
