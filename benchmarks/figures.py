@@ -3,9 +3,9 @@
     python benchmarks/figures.py           # brings the tables of all pages up to date
 
 A command that measures calls `publish`; with `--keep` it writes `figures/NAME.json`: date, commit,
-command, tables, and a digest of the code that the figures describe, without its comments. A page
-shows them between `<!-- figures NAME -->` and `<!-- end -->`. Figures whose code has changed since
-are marked.
+command, tables, and a digest of the code and constants that the figures describe, without comments.
+A page shows them between `<!-- figures NAME -->` and `<!-- end -->`. Figures whose code has changed
+since are marked.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -97,9 +98,9 @@ def _command(given: Sequence[str]) -> str:
 
 @functools.cache
 def digest(path: str) -> str:
-    """Return a digest of a file's code, or of the code in a folder, without comments."""
+    """Return a digest of a file, or of code and constants in a folder, without comments."""
     place = ROOT / path
-    files = [place] if place.is_file() else sorted(place.rglob("*.[pch]*"))
+    files = [place] if place.is_file() else sorted(place.rglob("*.*"))
     found = hashlib.sha256()
     for file in files:
         if file.suffix in WITHOUT_COMMENTS:
@@ -126,7 +127,18 @@ def _c_code(text: str) -> str:
     return " ".join(C_COMMENT.sub(" ", text).split())
 
 
-WITHOUT_COMMENTS: Final = {".py": _python_code, ".c": _c_code, ".h": _c_code}
+def _constants(text: str) -> str:
+    """Return TOML without comments and layout."""
+    return json.dumps(tomllib.loads(text))
+
+
+WITHOUT_COMMENTS: Final = {
+    ".py": _python_code,
+    ".c": _c_code,
+    ".h": _c_code,
+    ".toml": _constants,
+    ".json": str,
+}
 
 
 def shown(name: str, *, marks_older: bool = True) -> str:
