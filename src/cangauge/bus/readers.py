@@ -49,7 +49,8 @@ PERIODS_S: Final = (1.0, 60.0, 3600.0, 2.0**32 / 1e6, 86400.0)
 """Times after which clocks of loggers start again [s]: fractions of a second, seconds of a minute
 (slcan, CARBUS), minutes of an hour, 32 bits of microseconds, and times of day."""
 STALE_FRAMES: Final = 100
-"""First frames that a logger's buffer may have kept from before: more than a day, or ahead."""
+"""First frames whose first half may be left of an earlier recording in a logger's buffer: their
+stamps lie more than a day before the others, or after them."""
 PAUSE_S: Final = 100.0
 """Pause that is put between sessions in one file [s]: no charge is counted over it."""
 FIRST_DATE_S: Final = 1e9
