@@ -17,6 +17,7 @@ import pytest
 import cangauge
 from cangauge.__main__ import main
 from cangauge.errors import InputError
+from cangauge.extras.judge import explain
 from cangauge.extras.judge.judgement import narrowed
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
@@ -506,6 +507,34 @@ def test_a_current_that_wraps_is_refused(pack: Pack) -> None:
     wrapped = np.where(logs[0].current_a > 0.0, 655.36 - logs[0].current_a, -logs[0].current_a)
     with pytest.raises(cangauge.InputError, match="charge and SoC contradict each other"):
         cangauge.judge([replace(logs[0], current_a=wrapped)], model)
+
+
+def linearised(pack: Pack, monkeypatch, *stds: float) -> explain.Linearised:
+    """Return the model of a log whose only faults are offsets of the current, of one shape."""
+    seen = []
+    monkeypatch.setattr(
+        "cangauge.extras.judge.judgement.explain",
+        lambda *given: seen.append(given) or explain.explain(*given),
+    )
+    cangauge.judge(pack[1][:1], pack[0])
+    chain, known = seen[0]
+    offset = next(
+        each for each in explain.faults(chain, chain.fitting_pct) if each.fault == "current_offset"
+    )
+    alike = [replace(offset, std=std) for std in stds]
+    monkeypatch.setattr(explain, "faults", lambda *_: alike)
+    return explain.Linearised(chain, known, chain.fitting_pct)
+
+
+def test_what_no_log_tells_apart_keeps_its_prior(pack: Pack, monkeypatch) -> None:
+    at = linearised(pack, monkeypatch, 1e4, 1e4)
+    covariance = at.fitted([0, 1], 0).posterior.covariance[:2, :2]
+    assert np.array([1, -1]) @ covariance @ np.array([1, -1]) == pytest.approx(2e8, rel=1e-3)
+
+
+def test_a_set_of_all_faults_has_a_weight(pack: Pack, monkeypatch) -> None:
+    found = linearised(pack, monkeypatch, 1.0).neighbourhood(frozenset([0]))
+    assert set(found) == {frozenset(), frozenset([0])}
 
 
 def unbroken(days: int) -> cangauge.Log:

@@ -146,13 +146,8 @@ class Linearised:
     def rows(self, gauge: int | None) -> Rows:
         """Return the rows of the pack, and of all counts at one of `GAUGES`; None: of none."""
         if gauge not in self._rows:
-            table, log_norm = self._pack
-            if gauge is not None:
-                counts, of_counts = _total(self._gauge_parts(gauge))
-                table, log_norm = table + counts, log_norm + of_counts
-            # Shapes of faults may be alike: a little of each square keeps the matrix positive.
-            table = table + np.diag(1e-11 * (1.0 + np.diag(table)))
-            self._rows[gauge] = Rows(np.asarray(np.linalg.cholesky(table).T), log_norm)
+            pack = self._pack
+            self._rows[gauge] = pack if gauge is None else pack + _total(self._gauge_parts(gauge))
         return self._rows[gauge]
 
     @cached_property
@@ -173,8 +168,9 @@ class Linearised:
     def _weights(self, chosen: Sequence[int]) -> dict[Set, FloatArray]:
         """Return ln weights, over `GAUGES`, of a set, and with each other fault added to it."""
         taken = {self.faults[k].place for k in chosen}
-        others = [k for k, fault in enumerate(self.faults) if fault.place not in taken]
-        is_signed = [any(FAULTS[self.faults[k].fault].sides) for k in others]
+        free = [k for k, fault in enumerate(self.faults) if fault.place not in taken]
+        others = np.array(free, dtype=np.intp)
+        is_signed = np.array([any(FAULTS[self.faults[k].fault].sides) for k in others], dtype=bool)
         log_prior = np.array([fault.log_prior for fault in self.faults])
         std = self._std[self._n :]
         prior = Rows.prior(std[list(chosen)], others=len(others))
@@ -223,21 +219,24 @@ class Linearised:
         return not counts.size or any(np.asarray(shown)[counts[-1]] for shown in levels)
 
 
-def _total(parts: Iterable[Part]) -> tuple[FloatArray, float]:
-    """Return the Gram matrix of all whitened rows, y as its last column, and their `log_norm`.
+def _total(parts: Iterable[Part]) -> Rows:
+    """Return all rows as one.
 
-    Within a stretch most columns are 0 or alike.
+    Within a stretch most columns are 0 or alike: its own few rows wait until they are as many as
+    pay for a reduction of all columns. (A Gram matrix would square the condition number.)
     """
-    total, log_norm = np.zeros(()), 0.0
+    tables, waiting, log_norm = list[FloatArray](), 0, 0.0
     for X, y, root in parts:
         first = dict[bytes, int]()
         alike = [first.setdefault(column.tobytes(), k) for k, column in enumerate(X.T)]
         distinct, place = np.unique(alike, return_inverse=True)
         rows = Rows.correlated(X[:, distinct], y, root)
-        every = [*place.tolist(), -1]
-        total = total + (rows.table.T @ rows.table)[np.ix_(every, every)]
+        tables.append(rows.table[:, [*place.tolist(), -1]])
         log_norm += rows.log_norm
-    return total, log_norm
+        waiting += len(rows.table)
+        if waiting > 2 * (X.shape[1] + 1):
+            tables, waiting = [Rows(np.concatenate(tables), 0.0).reduced().table], 0
+    return Rows(np.concatenate(tables), log_norm).reduced()
 
 
 def _sparse(columns: Sequence[FloatArray | BoolArray | float], size: int) -> csr_array:
