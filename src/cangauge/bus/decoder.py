@@ -255,7 +255,7 @@ class SampleDecoder:
         self.vehicle = vehicle
         self.statistics = FrameStatistics() if statistics is None else statistics
         self.health: dict[str, SignalHealth] = {}
-        self.now_s = -math.inf
+        self.now_s = self._suspected_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s)
         current, voltage = vehicle.current, vehicle.voltage
         has_same_conditions = current.codec.conditions == voltage.codec.conditions
@@ -326,14 +326,7 @@ class SampleDecoder:
             key |= CAN_EFF_FLAG
         wanted = self._wanted.get(key)
         if wanted is None:
-            if self._by_pgn and key & CAN_EFF_FLAG:
-                wanted = self._wanted.get(self._by_pgn.get(key & pgn_mask(key), -1))
-            elif key in self._replies:
-                reply = self._replies[key].take(data, time_s)
-                if reply is not None:
-                    start = reply[: 3 if reply[0] == READ_BY_IDENTIFIER else 2]
-                    wanted = self._wanted.get(self._by_reply.get((key, start), -1))
-                    data = bytearray(reply)
+            wanted, data = self._by_group_or_reply(key, data, time_s)
             if wanted is None:
                 return None
         if wanted.last_s - time_s > self.vehicle.pair_within_s:
@@ -342,6 +335,8 @@ class SampleDecoder:
                 health.rewind(time_s)
         self.now_s = time_s
         payload = wanted.checked(data, time_s, key & 0xFF)
+        if wanted.suspected_s == time_s:
+            self._suspected_s = time_s
         return None if payload is None else self._values(wanted, payload, time_s)
 
     def _values(self, wanted: _Wanted, payload: bytearray, time_s: float) -> Sample | None:
@@ -378,12 +373,24 @@ class SampleDecoder:
         self.statistics.samples += sample is not None
         return sample
 
+    def _by_group_or_reply(
+        self, key: int, data: bytearray, time_s: float
+    ) -> tuple[_Wanted | None, bytearray]:
+        """Return the wanted message of a J1939 group, or of a whole reply, and its payload."""
+        if self._by_pgn and key & CAN_EFF_FLAG:
+            return self._wanted.get(self._by_pgn.get(key & pgn_mask(key), -1)), data
+        reply = self._replies[key].take(data, time_s) if key in self._replies else None
+        if reply is None:
+            return None, data
+        start = reply[: 3 if reply[0] == READ_BY_IDENTIFIER else 2]
+        return self._wanted.get(self._by_reply.get((key, start), -1)), bytearray(reply)
+
     def reasons(self, now_s: float) -> Reason:
         """Return which signals are missing at bus time `now_s` [s], and why.
 
         One without a further reason is old, never came, or is sent as "not available".
         """
-        is_suspected = any(each.is_suspected(now_s) for each in self._wanted.values())
+        is_suspected = abs(now_s - self._suspected_s) < SUSPECTED_FOR_S
         reasons = _DUPLICATE if is_suspected else _NO_REASON
         for health, missing in self._needed:
             if not health.is_usable(now_s):
