@@ -146,7 +146,7 @@ def _stated_bytes(file: BinaryIO, path: str | PathLike[str]) -> int:
 def _too_large(path: str | PathLike[str], limit: int, what: str) -> InputError:
     size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
     problem = f"larger than the {size} that {what} may have"
-    cure = "check that this is the right file, or split it"
+    cure = "check that this is the right file, and that it is whole; or split it"
     return InputError(problem, source=path, cure=cure)
 
 

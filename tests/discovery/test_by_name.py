@@ -50,6 +50,9 @@ PUBLIC = {
         ("Pack_Current", ""), ("Pack_Voltage", ""), ("High_Cell_Volt", ""), ("Low_Cell_Volt", ""),
         ("MaxChargeCurrent", ""),
     ),
+    "blank_units": (
+        ("Pack_Current", " "), ("Pack_Voltage", " "), ("High_Cell_Volt", " "),
+    ),
     "stellantis": (
         ("HV_BATT_REAL_CURR_HD", "A"), ("HV_BATT_REAL_VOLT_HD", "V"),
         ("HV_BATT_MAX_REAL_CURR", "A"), ("HV_BATT_NOM_CH_VOLTAGE", "V"),

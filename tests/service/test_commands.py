@@ -105,6 +105,7 @@ BAD_OPTIONS = [
     (["--channel", "can7x"], "can7x"),
     (["--vehicle", "moped"], "moped"),
     (["--bus-option", "fast"], "K=V"),
+    (["--bus-option", f"bitrate={'9' * 5000}"], "4300 digits"),
 ]
 """Of both commands."""
 RUN, REPLAY = ["run", *MODEL, "--record", "out.log"], ["replay", leaf_model_path()]

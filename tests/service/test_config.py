@@ -91,6 +91,7 @@ def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
         ('model = "m"\n[rules.A]\npolynomial = 1', "rules", "unknown key"),
         ('model = "m"\n[checks.current]\nlowest = 1', "checks", "unknown key"),
         ('vehicle = "generic"', "model", "is missing"),
+        ('modle = "x"', "modle", "did you mean model"),
         ("model = 3", "model", "must be a valid string"),
         ("model = ", None, "not TOML"),
     ],

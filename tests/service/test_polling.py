@@ -137,6 +137,16 @@ def test_requests_stop_while_another_tester_asks() -> None:
     assert poller.due(0.3 + OTHER_TESTER_S) is not None
 
 
+def test_each_of_many_replies_is_asked_for() -> None:
+    targets = [PollTarget(0x79B, 0x7BB, bytes([0x61, place])) for place in range(12)]
+    poller, asked = Poller(targets, every_s=5.0), set()
+    for step in range(200):
+        if (request := poller.due(0.1 * step)) is not None:
+            asked.add(request.data[2])
+            poller.take(reply(bytes([2, 0x61, request.data[2]])), 0.1 * step)
+    assert asked == set(range(12))
+
+
 @pytest.mark.parametrize(
     "reply_bytes",
     [b"\x02\x61\x04", b"\x02\x61\x02", b"\x03\x7f\x21\x11", b"\x03\x7f\x21\x78", b"\x01\x7f"],

@@ -291,7 +291,7 @@ def signal_codec(
         conditions.append((other_bits, frozenset({value & other_bits.mask})))
     return SignalCodec(
         name=signal.name,
-        unit=signal.unit or "",
+        unit=(signal.unit or "").strip(),
         field=bits,
         is_signed=is_signed,
         float_format=_FLOATS[signal.length] if conversion.is_float else "",

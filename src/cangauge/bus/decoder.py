@@ -325,10 +325,10 @@ class SampleDecoder:
         if message.is_extended_id:
             key |= CAN_EFF_FLAG
         wanted = self._wanted.get(key)
-        if wanted is None:
+        if wanted is None and (self._by_pgn or key in self._replies):
             wanted, data = self._by_group_or_reply(key, data, time_s)
-            if wanted is None:
-                return None
+        if wanted is None:
+            return None
         if wanted.last_s - time_s > self.vehicle.pair_within_s:
             # Time runs backwards: a restarted log, or a clock that was set.
             for health in self.health.values():

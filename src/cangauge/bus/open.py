@@ -171,7 +171,10 @@ def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
         if not equals or not key.isidentifier():
             problem, cure = "not of the form K=V", "e.g. bitrate=500000"
             raise InputError(problem, field="--bus-option", value=text, cure=cure)
-        options[key] = cast_from_string(value)
+        try:
+            options[key] = cast_from_string(value)
+        except ValueError as error:  # a number of more than 4,300 digits
+            raise InputError(str(error), field="--bus-option", value=text[:40]) from error
     return options
 
 
@@ -292,8 +295,9 @@ class PolledSocketcanBus(SocketcanBus):
             if error.error_code == errno.EAGAIN:
                 return None
             raise
-        if message is not None:
-            message.channel = self.channel
+        if message is None or not (self._is_filtered or self._matches_filters(message)):
+            return None  # the kernel takes no more than 512 filters
+        message.channel = self.channel
         return message
 
 

@@ -16,9 +16,9 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
-from pydantic import PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from cangauge.model.fields import Fields
 from cangauge.types import (
@@ -89,8 +89,8 @@ class SignalChecks(Fields):
     highest: float = math.inf
     max_jump: PositiveFloat = math.inf
     max_rate_per_s: PositiveFloat = 0.0
-    invalid_after: PositiveInt = 5
-    valid_after: PositiveInt = 3
+    invalid_after: Annotated[int, Field(ge=1, le=1000)] = 5
+    valid_after: Annotated[int, Field(ge=1, le=1000)] = 3
     stuck_after_s: PositiveFloat | None = None
     timeout_s: PositiveFloat | None = None
 

@@ -434,18 +434,19 @@ def load_config(
     for name in given.keys() & {"ids", "bus_options"}:
         if isinstance(data.get(name), dict):
             merged[name] = data[name] | given[name]
-    if "model" not in merged:
-        field = "-m/--model" if path is None else "model"
-        cure = "give -m MODEL (made by `cangauge fit`)"
-        raise InputError("is missing", source=path, field=field, cure=cure)
     try:
-        config = validated(RunConfig, merged, path or "")
+        # Any name in place of a missing model: first what is wrong in the file.
+        config = validated(RunConfig, {"model": "-"} | merged, path or "")
     except InputError as error:
         field = error.field or ""
         if value_at(given, field) is None:
             raise
         option = config_keys().get(field, {}).get("option", field).rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
+    if "model" not in merged:
+        field = "-m/--model" if path is None else "model"
+        cure = "give -m MODEL (made by `cangauge fit`)"
+        raise InputError("is missing", source=path, field=field, cure=cure)
     return config if path is None else config.named(path, given)
 
 

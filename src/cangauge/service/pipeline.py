@@ -115,6 +115,7 @@ class Pipeline:
         self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: PackReport | None = None
+        self._findings: tuple[Reason, Reason, bool, bool] | None = None
         self.estimator = make_estimator(model, _with_sensors(settings.estimator, vehicle))
         self._begin_signals()
 
@@ -252,12 +253,17 @@ class Pipeline:
         other do not make an estimate fresh.
         """
         estimate = self._estimate
-        bits = int(estimate.reasons) & ~_VOLTAGE_MISSING | int(self.decoder.reasons(now_s))
-        if self._lacks_voltage:
-            bits |= _VOLTAGE_MISSING
-        if self._refused >= MISSED_UNTIL_OLD:
-            bits |= _INPUT_STALE
-        return estimate if bits == estimate.reasons else _with_reasons(estimate, REASONS[bits])
+        signals, lacks_voltage = self.decoder.reasons(now_s), self._lacks_voltage
+        is_refused = self._refused >= MISSED_UNTIL_OLD
+        findings = estimate.reasons, signals, lacks_voltage, is_refused
+        if findings != self._findings:  # they change seldom, and flags are slow
+            bits = int(estimate.reasons) & ~_VOLTAGE_MISSING | int(signals)
+            bits |= _VOLTAGE_MISSING * lacks_voltage | _INPUT_STALE * is_refused
+            self._findings, self._reasons = findings, REASONS[bits]
+            self._status = status_of(self._reasons)
+        if self._reasons is estimate.reasons:
+            return estimate
+        return estimate._replace(reasons=self._reasons, status=self._status)
 
     # --- estimates → frames
 

@@ -71,7 +71,8 @@ class Poller:
                 return None
             self.counts["unanswered"] += 1
             self._end(self._awaited, now_s, failed=True)
-        target = min(self._due_s, key=self._next_s)
+        # Of several that are due, the one that has waited longest since it was due.
+        target = min(self._due_s, key=lambda each: (self._next_s(each), self._due_s[each]))
         if now_s < max(self._next_s(target), self._quiet_until_s):
             return None
         self.asked_s[target.request_id] = now_s
