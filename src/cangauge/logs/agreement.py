@@ -189,7 +189,7 @@ def _option(columns: Mapping[str, tuple[str, Sequence[str]]]) -> str:
 
 def _of_time(log: Log, in_seconds: bool | None) -> list[_Hypothesis]:
     first, step = float(log.time_s[0]), np.diff(log.time_s)
-    usual = typical(step) if step.size else 1.0
+    usual = float(np.median(step)) if step.size else 1.0
     finer = _fitting(usual, ("ms", "us", "ns"))
     coarser = ["d"] if first > LIMITS["spreadsheet_d"] else _fitting(usual, ("min", "h", "d"))
     looks_finer, looks_coarser = (

@@ -83,10 +83,10 @@ def numbers_in(beginning: Any) -> dict[str, Any]:
     They are then parsed without the text, which would take twice the memory of a long log.
     """
     columns = dict(zip(beginning.column_names, beginning.columns, strict=True))
-    texts = [cells for cells in columns.values() if is_text(_as_numbers(cells))]
-    is_spelled = any(map(_begins_with_number, texts))
-    bare = {} if is_spelled else columns
-    return {name: pa.float64() for name, cells in bare.items() if not is_text(_as_numbers(cells))}
+    bare = [name for name, cells in columns.items() if not is_text(_as_numbers(cells))]
+    texts = [_present(cells, name) for name, cells in columns.items() if name not in bare]
+    texts = [cells for cells in texts if is_text(_as_numbers(cells))]
+    return {} if any(map(_begins_with_number, texts)) else dict.fromkeys(bare, pa.float64())
 
 
 def _as_numbers(cells: Any) -> Any:

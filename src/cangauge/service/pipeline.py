@@ -123,7 +123,7 @@ class Pipeline:
         """Begin to judge the signals anew, for the present vehicle and model."""
         self._pack = _pack_of(self.estimator)
         self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
-        self._voltage_s, self._without_voltage = math.inf, 0
+        self._voltage_s, self._without_voltage, self._lacks_voltage = math.inf, 0, False
         self._begin_cells()
 
     def _begin_cells(self) -> None:
@@ -212,19 +212,6 @@ class Pipeline:
         """Whether good voltages come, but no longer with a current."""
         return self._lacks_voltage and self.decoder.health["voltage"].is_usable(self.decoder.now_s)
 
-    @property
-    def _lacks_voltage(self) -> bool:
-        """Whether samples lack the voltage lastingly, though its frames may come.
-
-        They do when several consecutive samples have no voltage, and the last voltage is older than
-        its time-out. The number alone is not enough: a voltage that is sent less often than the
-        current is in few samples.
-        """
-        if self.latest_sample is None or self._without_voltage < MISSED_AT_LEAST:
-            return False
-        age_s = self.latest_sample.time_s - self._voltage_s
-        return age_s > self.decoder.health["voltage"].timeout_s
-
     def _estimate_after(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample, self._report = sample, None
@@ -232,11 +219,7 @@ class Pipeline:
         # The estimator treats a refused voltage otherwise than one that never came, as offline.
         self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
         self._estimate = self.estimator.estimate
-        if math.isnan(sample.voltage_v):
-            self._voltage_s = min(self._voltage_s, sample.time_s)  # time may run backwards
-            self._without_voltage += 1
-        else:
-            self._voltage_s, self._without_voltage = sample.time_s, 0
+        self._note_voltage(sample)
         self._refused = self._refused + 1 if self.estimator.is_refused else 0
         self.taken += not self.estimator.is_refused
         cells, received = self.cells, self.decoder.cells
@@ -244,6 +227,21 @@ class Pipeline:
             volts, times = received.take(sample.time_s)
             changes = self.estimator.current_changes(sample.time_s, times)
             cells.update(self.estimator.pack_tick(sample), volts, changes)
+
+    def _note_voltage(self, sample: Sample) -> None:
+        """Note whether samples lack the voltage lastingly, though its frames may come.
+
+        They do when several consecutive samples have no voltage, and the last voltage is older than
+        its time-out. The number alone is not enough: a voltage that is sent less often than the
+        current is in few samples.
+        """
+        if not math.isnan(sample.voltage_v):
+            self._voltage_s, self._without_voltage, self._lacks_voltage = sample.time_s, 0, False
+            return
+        self._voltage_s = min(self._voltage_s, sample.time_s)  # time may run backwards
+        self._without_voltage += 1
+        is_old = sample.time_s - self._voltage_s > self.decoder.health["voltage"].timeout_s
+        self._lacks_voltage = is_old and self._without_voltage >= MISSED_AT_LEAST
 
     def _with_health(self, now_s: float) -> Estimate:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.

@@ -148,7 +148,8 @@ class Export:
             draft.negate_current(f"{self.name} stores discharge as negative")
         self._take_temperature(draft, cells, sensors, ambient)
         for column in excluded:
-            is_excluded = pc.fill_null(pc.equal(cells[column.place], "Yes"), fill_value=False)
+            words = cells[column.place].cast("string")  # a column of 0 is one of numbers
+            is_excluded = pc.fill_null(pc.equal(words, "Yes"), fill_value=False)
             draft.keep(~np.asarray(is_excluded, dtype=bool), "that the cycler excludes dropped")
         if self.waits:
             is_waiting = draft.values["time_s"] < 0.0
