@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+import re
 import threading
 import time
 from pathlib import Path
@@ -137,9 +138,10 @@ def test_a_service_for_another_vehicle_is_an_error() -> None:
             play(port, source, **settings, stop=never)
 
 
-def test_a_second_sender_on_the_bus_is_an_error() -> None:
+def test_a_second_sender_is_an_error_or_loses_samples_that_are_counted() -> None:
+    """Its frames add samples, or spoil some: the order of two threads decides."""
     with virtual_service("crowd", REPLAYED), virtual_port("crowd") as intruder:
-        stop = threading.Event()
+        started, stop = threading.Event(), threading.Event()
 
         def intrude() -> None:
             encoder = FrameEncoder(Vehicle.load("generic"))
@@ -148,15 +150,19 @@ def test_a_second_sender_on_the_bus_is_an_error() -> None:
                     return
                 for frame in encoder.encode(sample):
                     intruder.send(frame)
+                started.set()
 
         other = threading.Thread(target=intrude)
         other.start()
         try:
-            with pytest.raises(CangaugeError, match=r"another program|have been processed"):
-                play_log("crowd", 100.0, MAX)
+            assert started.wait(PATIENCE_S)
+            said = f"{play_log('crowd', 100.0, MAX).lost} lost"
+        except CangaugeError as error:
+            said = str(error)
         finally:
             stop.set()
             other.join()
+    assert re.search(r"another program|have been processed|[1-9]\d* lost", said)
 
 
 class LossyBus:
