@@ -195,6 +195,28 @@ def test_lost_frames_are_counted_and_the_replay_goes_on() -> None:
     assert state.acknowledged + state.lost == state.samples == 300
 
 
+def test_a_receiver_that_processed_more_than_was_sent_is_an_error() -> None:
+    """Another program sends to it too, or it was restarted."""
+    publisher = SocPublisher(acknowledge_every=1)
+    receiver = open_bus(BusAddress("virtual", "more"))
+
+    def receive() -> None:
+        receiver.send(publisher.detail_frame(NOTHING_YET, 0))
+        while (message := receiver.recv(PATIENCE_S)) is not None:
+            if message.arbitration_id == 0x401:
+                receiver.send(publisher.detail_frame(NOTHING_YET, 1000))
+                return
+
+    thread = threading.Thread(target=receive)
+    source = LogSource(short_log(50.0), Vehicle.load("generic"))
+    said = pytest.raises(CangaugeError, match=r"processed 1000 samples where .* another program")
+    with virtual_port("more", SOC_FRAMES) as port, said:
+        thread.start()
+        play(port, source, **MAX, stop=never)
+    thread.join()
+    receiver.shutdown()
+
+
 def test_frames_under_way_are_bounded() -> None:
     """The receiver's queue stays below what a default socket buffer holds."""
     bus = open_bus(BusAddress("virtual", "window"), SOC_FRAMES)
