@@ -8,11 +8,9 @@ from __future__ import annotations
 import signal
 import struct
 import subprocess
-import threading
 import time
 from pathlib import Path
 from random import Random
-from typing import Self
 
 import can
 import pytest
@@ -24,6 +22,7 @@ from whole_processes import (
     VEHICLE,
     YEAR_S,
     Life,
+    Traffic,
     clean,
     errors,
     write_state,
@@ -41,32 +40,21 @@ pytestmark = [
 OWN_PCT, EVERY_S = 11, 0.1
 
 
-class Battery(threading.Thread):
+class Battery(Traffic):
     """Sends a drive, its own SoC (0x355) and the time (0x351) on vcan0; listens on vcan1."""
 
     address = BusAddress("socketcan", "vcan0")
 
     def __init__(self) -> None:
-        super().__init__(daemon=True)
         if not has_socketcan("vcan1"):
             for command in ("link add vcan1 type vcan", "link set vcan1 up"):
                 subprocess.run(["ip", *command.split()], check=True)
         self._battery, self._inverter = (
             can.Bus(channel, interface="socketcan") for channel in ("vcan0", "vcan1")
         )
-        self._over = threading.Event()
+        super().__init__(self._battery, self._inverter)
         self.late_s: list[float] = []
         self.soc_pct: list[int] = []
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self.join()
-        self._battery.shutdown()
-        self._inverter.shutdown()
 
     def run(self) -> None:
         """Send the samples until the end."""

@@ -10,13 +10,12 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from random import Random
-from typing import Any, Self
+from typing import Any
 
 import pytest
 from whole_processes import (
@@ -27,6 +26,7 @@ from whole_processes import (
     VEHICLE,
     YEAR_S,
     Life,
+    Traffic,
     clean,
     errors,
     write_state,
@@ -53,7 +53,7 @@ STRETCH_S = 300
 """Bus time after which a night follows, in replays [s]: the judge keeps the stretch as a log."""
 
 
-class Battery(threading.Thread):
+class Battery(Traffic):
     """Sends a drive on a UDP bus and reads the estimates of a service.
 
     Parameters
@@ -69,21 +69,11 @@ class Battery(threading.Thread):
     def __init__(
         self, number: int, samples: list[Sample], every_s: float, *, is_replay: bool
     ) -> None:
-        super().__init__(daemon=True)
         self.address = BusAddress("udp_multicast", "239.74.163.7", {"port": 45_000 + number})
         self._bus = open_bus(self.address)
+        super().__init__(self._bus)
         self._samples, self._every_s, self._is_replay = samples, every_s, is_replay
-        self._over = threading.Event()
         self.estimates: list[dict[str, Any]] = []
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self.join()
-        self._bus.shutdown()
 
     def run(self) -> None:
         """Send the samples over and over, the later ones after a night."""
