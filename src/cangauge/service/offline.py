@@ -7,6 +7,7 @@ same bit for bit.
 from __future__ import annotations
 
 import time
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
@@ -315,7 +316,7 @@ def estimate_capture(
     best = max(found, key=attrgetter("pipeline.samples"))
     pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
     settings, statistics = pipeline.estimator.settings, pipeline.decoder.statistics
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).T
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     recorded = CaptureSamples(
         _without_steps_back(time_s),
         current_a,
@@ -371,7 +372,7 @@ class _Bus:
 
     pipeline: Pipeline
     estimates: list[Estimate] = field(default_factory=list)
-    values: list[tuple[float, ...]] = field(default_factory=list)
+    values: array[float] = field(default_factory=lambda: array("d"))
     pack_rows: PackRows = field(default_factory=list)
 
     def collect(self, *, keeps_pack: bool) -> None:
@@ -379,7 +380,7 @@ class _Bus:
         sample = self.pipeline.latest_sample
         if sample is not None:
             self.estimates.append(self.pipeline.latest)
-            self.values.append((*sample, self.pipeline.decoder.reference_soc_pct))
+            self.values.extend((*sample, self.pipeline.decoder.reference_soc_pct))
             if keeps_pack:
                 _add_row(self.pack_rows, PACK_EVERY_S, sample.time_s, self.pipeline.report)
 
