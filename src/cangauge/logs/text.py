@@ -7,7 +7,7 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, product, repeat
 from typing import Any, Final, NamedTuple
@@ -44,8 +44,8 @@ class TextTable(NamedTuple):
     remarks: list[str]
     word: str = ""
 
-    def columns(self, places: Sequence[int]) -> dict[int, Any]:
-        """Read columns, as `read_cells`.
+    def columns(self, places: Sequence[int], apart: Collection[int] = ()) -> dict[int, Any]:
+        """Read columns, as `read_cells`; the marks in those `apart` tell nothing of the others.
 
         A cut last line and closing remarks of the exporter are left out, with a remark.
 
@@ -95,7 +95,9 @@ class TextTable(NamedTuple):
             doubt = "if the file was cut off, its last value may be short"
             self.remarks.append(f"the last line has no line end: {doubt}")
         headings = [*self.headings, *repeat("", width)]
-        return read_cells({place: table.column(names[place]) for place in places}, headings)
+        parts = [[place for place in places if (place in apart) is each] for each in (False, True)]
+        read = (read_cells({p: table.column(names[p]) for p in part}, headings) for part in parts)
+        return {place: cells for part in read for place, cells in part.items()}
 
     def _width(self, places: Sequence[int]) -> int:
         """Return the number of cells of the first row, which may be another than the header's."""
