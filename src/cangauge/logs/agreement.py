@@ -4,7 +4,7 @@
 
 - **unit or column**: the sizes of all columns fit another unit, a swap of two, or a
   field that wraps. The log is refused, with the unit to state;
-- **sign** (`sign`): the current charges. It is inverted where nothing but the data tells its sign;
+- **sign** (`sign`): positive current charges. It is inverted if only the data show the sign;
 - **own charge column** (`charge`): one of the columns in Ah counts the current.
 """
 
@@ -65,7 +65,7 @@ def agreeing(
     stated : collection of str
         Columns whose unit the user states.
     sign_by : {"format", "user", "data"}
-        What tells the sign of the current.
+        Source of the sign of the current.
     counters : mapping, optional
         Columns in Ah by their headings, shape (n,).
 
@@ -83,7 +83,7 @@ def agreeing(
 
 
 def _discharging(log: Log, sign_by: SignSource) -> Log:
-    """Return a log whose sign of current is that of the data if these tell it; remark on doubts.
+    """Return a log with the sign of current that the data show, if they do; remark on doubts.
 
     A SoC that contradicts the sign which the voltage alone proves is left out.
     """

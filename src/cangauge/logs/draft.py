@@ -45,7 +45,7 @@ class DraftLog:
     temperature_source : str
         Location of the temperature sensor.
     sign_by : {"format", "user", "data"}
-        What tells the sign of the current.
+        Source of the sign of the current.
     negated : bool
         The file stores discharge as negative.
     in_seconds, stated

@@ -1,12 +1,12 @@
 """The sign of current of a log: positive discharges.
 
-What tells it, the first that does:
+The first of these sources that is available determines it:
 
 1. the user (`--sign`, or the factor of the column), or the format;
-2. of a current that is never negative, a column of words that says when it charges
+2. a column of words that says when the pack charges, if the current is never negative
    (`table.direct_by_state`);
-3. the data (`sign_of_current`), where `agreement` inverts a sign that nothing else tells, and
-   remarks on one that the data contradict.
+3. the data (`sign_of_current`). `agreement` inverts the current if neither user nor format states
+   its sign. If they do and the data contradict them, it remarks on it.
 
 Three kinds of evidence are in the data:
 
@@ -37,7 +37,7 @@ from cangauge.logs.quantities import LIMITS
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
 SignSource = Literal["format", "user", "data"]
-"""What tells the sign of a log's current."""
+"""Source of the sign of a log's current."""
 
 STEP_SPACING_S: Final = 1.0
 """Time between the rows whose difference is a step [s]."""

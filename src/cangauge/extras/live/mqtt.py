@@ -1,8 +1,8 @@
 """Publish a running service's state to an MQTT broker, with Home Assistant's discovery.
 
-Needs paho-mqtt (extra `mqtt`), whose thread has the network. A state that cannot be sent is
-dropped, since the next one replaces it. A broker that sends messages is left: nobody has subscribed
-to any, and paho would keep those of QoS 2 without a limit.
+Needs paho-mqtt (extra `mqtt`), whose thread does the network I/O. A state that cannot be sent is
+dropped, because the next one replaces it. Nothing is subscribed. If the broker sends a message
+anyway, the connection is closed: paho keeps messages of QoS 2 without a limit.
 """
 
 from __future__ import annotations
@@ -213,10 +213,10 @@ class MqttPublisher(Output):
         return self._client.publish(topic, text, qos=0, retain=True)
 
     def _on_log(self, client: Client, _userdata: object, _level: object, text: str) -> None:
-        # The only place where paho tells of a message of QoS 2 before its release.
+        # paho reports a message of QoS 2 before its release in its log only.
         connection = client.socket()
         if text.startswith("Received PUBLISH") and isinstance(connection, socket.socket):
-            self._emit(logging.WARNING, "mqtt.flooded", "it sent a message that nobody asked for")
+            self._emit(logging.WARNING, "mqtt.flooded", "it sent a message without a subscription")
             with suppress(OSError):  # the broker has closed it
                 connection.shutdown(socket.SHUT_RDWR)
 

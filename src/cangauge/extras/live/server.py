@@ -1,8 +1,8 @@
 """Answer the browsers of the live page.
 
-Each viewer is sent what is new once it has taken what came before, so a slow or hidden one costs
-nothing, here or in the service. A whole span is made once for all who ask for it, so many questions
-do not delay other viewers.
+A viewer gets new rows only after it has read the previous ones, so that a slow or hidden viewer
+costs nothing, here or in the service. A whole span is encoded once and sent to all who request it,
+so that many requests do not delay other viewers.
 """
 
 from __future__ import annotations
