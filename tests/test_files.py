@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
-from cangauge._files import atomic_path, check_writable, write_text_atomic
+from cangauge import _files
+from cangauge._files import atomic_path, check_writable, read_bounded, write_text_atomic
 from cangauge.errors import CangaugeError, InputError
 
 
@@ -101,3 +103,15 @@ def test_a_device_is_written_and_never_replaced() -> None:
 def test_checking_leaves_nothing_behind(tmp_path: Path) -> None:
     check_writable(tmp_path / "later.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_large_file_takes_its_size_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_files, "_PIECE_BYTES", _files.MIB)
+    path, content = tmp_path / "log.csv", os.urandom(_files.MIB) * 16
+    path.write_bytes(content)
+    tracemalloc.start()
+    read = read_bounded(path, 64 * _files.MIB, "a log")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert read == content
+    assert peak < 1.4 * len(content)

@@ -118,15 +118,14 @@ def read_beginning(file: io.BufferedReader, size: int) -> bytes:
 
 def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the rest of an open file; raise InputError if it has more than `limit` bytes."""
-    pieces, size = list[bytes](), _stated_bytes(file, path)
-    if size <= limit:
-        size = 0
-        while size <= limit and (piece := file.read(min(limit + 1, _PIECE_BYTES))):
-            pieces.append(piece)
-            size += len(piece)
-    if size > limit:
+    if _stated_bytes(file, path) > limit:
         raise _too_large(path, limit, what)
-    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+    content = io.BytesIO()  # grows in place: pieces, joined at the end, take the memory twice
+    while content.tell() <= limit and (piece := file.read(min(limit + 1, _PIECE_BYTES))):
+        content.write(piece)
+    if content.tell() > limit:
+        raise _too_large(path, limit, what)
+    return content.getvalue()
 
 
 def _stated_bytes(file: BinaryIO, path: str | PathLike[str]) -> int:

@@ -508,17 +508,19 @@ def _stated_error(
     mean_v: float,
 ) -> dict[str, Any]:
     """Return the error that a model file states: of left-out logs, or of the fit without any."""
-    error_v = np.concatenate([*held_out_error_v, np.empty(0)])
-    if not np.isfinite(error_v).any():
+    judged = sum(int(np.isfinite(error_v).sum()) for error_v in held_out_error_v)
+    if not judged:
         return {
             "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * residual_v / mean_v,
             "voltage_rmse_v": residual_v,
             "judged_on": "the rows of the fit itself (too few logs to leave one out)",
         }
-    volts = np.concatenate([item.voltage_v for item in rows])
+    of_logs = list(zip(held_out_error_v, rows, strict=True))
+    relative = sum(float(np.nansum(np.abs(error) / item.voltage_v)) for error, item in of_logs)
+    square_v2 = sum(float(np.nansum(error_v**2)) for error_v in held_out_error_v)
     return {
-        "voltage_mae_pct": 100.0 * float(np.nanmean(np.abs(error_v) / volts)),
-        "voltage_rmse_v": float(np.sqrt(np.nanmean(error_v**2))),
+        "voltage_mae_pct": 100.0 * relative / judged,
+        "voltage_rmse_v": (square_v2 / judged) ** 0.5,
         "judged_on": "whole logs left out in turn",
     }
 

@@ -249,8 +249,10 @@ class Identification:
         """Whether the error that the model states is of logs left out in turn."""
         return any(np.isfinite(error_v).any() for error_v in self.held_out_error_v)
 
-    def _mean(self, values: Iterable[FloatArray]) -> float:
-        return float(np.mean(np.concatenate(list(values))))
+    def _mean(self, of_logs: Iterable[FloatArray]) -> float:
+        """Return the mean over the rows of all logs, of values on the rows of each."""
+        total = sum(float(np.sum(values)) for values in of_logs)
+        return total / sum(len(item.rows) for item in self.fits)
 
     @property
     def voltage_mae_pct(self) -> float:
