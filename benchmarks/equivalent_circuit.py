@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from cangauge._typing import FloatArray
-from cangauge.model.effects.base import Load
+from cangauge.model.effects.base import Inputs
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 
@@ -112,16 +112,16 @@ def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) 
     """Return the voltage after a long rest [V], shape (n,)."""
     celsius = np.full_like(soc_pct, temperature_c)
     zero = np.zeros_like(soc_pct)
-    load = Load(np.arange(soc_pct.size, dtype=np.float64), zero, celsius, zero)
-    return extended.model.pseudo_ocv(soc_pct, celsius) + _added_v(extended, load, soc_pct)
+    inputs = Inputs(np.arange(soc_pct.size, dtype=np.float64), zero, celsius, zero)
+    return extended.model.pseudo_ocv(soc_pct, celsius) + _added_v(extended, inputs, soc_pct)
 
 
-def _added_v(extended: ExtendedModel, load: Load, soc_pct: FloatArray) -> FloatArray:
+def _added_v(extended: ExtendedModel, inputs: Inputs, soc_pct: FloatArray) -> FloatArray:
     """Return the sum of the effects' voltages [V], shape (n,)."""
     every = slice(None)
     volts = np.zeros_like(soc_pct)
     for effect, values in extended.effects:
-        volts += effect.added_v(load, every, soc_pct, values, extended)
+        volts += effect.added_v(inputs, every, soc_pct, values, extended)
     return volts
 
 
@@ -151,8 +151,8 @@ class _StepResponse:
         unit_v = columns @ model.load_coefficients[1:]
 
         def volts(amperes: float) -> FloatArray:
-            load = Load(time_s, amperes * one, temperature_c * one, amperes * unit_v)
-            added_v = _added_v(self._extended, load, soc_pct * one)
+            inputs = Inputs(time_s, amperes * one, temperature_c * one, amperes * unit_v)
+            added_v = _added_v(self._extended, inputs, soc_pct * one)
             return np.asarray(amperes * unit_v + added_v)
 
         return np.asarray((volts(0.0) - volts(current_a))[1:] / current_a)

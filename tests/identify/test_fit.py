@@ -25,7 +25,7 @@ from cangauge.identify.least_squares import (
     solve,
     solve_scaled,
 )
-from cangauge.identify.rows import BLOCK, FitRows, fit_rows
+from cangauge.identify.rows import CHUNK, FitRows, fit_rows
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
@@ -101,7 +101,7 @@ def test_is_the_weighted_least_squares_of_all_rows() -> None:
     """The sums of the logs against one dense system with a column for the level of each log."""
     long = synthetic_log(start_pct=92.0, end_pct=30.0, hours=6.0, model=CELLS)
     rows = [fit_rows(log, CAPACITY_AH) for log in [*trips(2), long]]
-    assert len(rows[-1]) > BLOCK
+    assert len(rows[-1]) > CHUNK
     found = solve([log_sums(item, OXIDE) for item in rows], PACK)
     size, logs = found.coefficients.size, len(rows)
     weight = np.concatenate([row_weights(r.soc_pct, r.row_s, OXIDE) for r in rows])
@@ -190,7 +190,7 @@ def test_a_long_log_needs_memory_for_few_numbers_a_row() -> None:
     fit(log, capacity_ah=CAPACITY_AH)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 2000 * BLOCK + 80 * len(log)  # all columns of all rows would be 328 bytes a row
+    assert peak < 2000 * CHUNK + 80 * len(log)  # all columns of all rows would be 328 bytes a row
 
 
 def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:

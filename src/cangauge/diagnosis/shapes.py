@@ -16,7 +16,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.rows import Simulated
-from cangauge.model.effects.base import Effect, Load, Pack
+from cangauge.model.effects.base import Effect, Inputs, Pack
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates
 
 STEP_ID: Final = "resistance_step"
@@ -134,14 +134,14 @@ def shape_columns(of: Simulated, tried: Sequence[Shape]) -> FloatArray:
     currents = model.model.currents(true.time_s, true.current_a, slice(None))
     table = model.model.load_columns(true.temperature_c, currents)
     drop_v = table[:, 1:] @ model.model.load_coefficients[1:]
-    load = Load(true.time_s, true.current_a, true.temperature_c, drop_v)
+    inputs = Inputs(true.time_s, true.current_a, true.temperature_c, drop_v)
     soc = plain.soc_pct[rows]
     found = np.empty((rows.size, len(tried)))
     for k, each in enumerate(tried):
         shape = each.in_log(of.trace.log.duration_s)
         effect, values = shape.effect, shape.values(shape.about)
         if effect.adds_voltage:
-            changed = effect.added_v(load, rows, soc, values, model)
+            changed = effect.added_v(inputs, rows, soc, values, model)
         else:
             changed = plain.residual_v - of.with_effect(effect, values).residual_v
         found[:, k] = changed * (shape.bound / shape.about)

@@ -31,7 +31,7 @@ from cangauge.estimation.core_constants import (
 )
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.model.delay_line import BLOCK, SPACING_S, DelayLine
+from cangauge.model.delay_line import DROPPED, SPACING_S, DelayLine
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
 from cangauge.types import REASONS, Estimate, Sample, Status
@@ -113,8 +113,8 @@ class CompiledEstimator(Estimator):
         self.native: Any = _core.Core(
             _arrays(model_constants(self, forms) | _of_effects(forms)),
             _arrays(settings_constants(self)),
-            int(2.0 * online.delay_line.longest_s / SPACING_S) + 2 * BLOCK,
-            BLOCK,
+            int(2.0 * online.delay_line.longest_s / SPACING_S) + 2 * DROPPED,
+            DROPPED,
             SPACING_S,
             Estimate,
             tuple(Status),

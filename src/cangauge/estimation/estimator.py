@@ -109,8 +109,8 @@ class Estimator:
         self.hypotheses = Hypotheses(self.online)
         self._clock = EstimatorClock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
-        # The counter where the filter is predicted to, and where the counted SoC starts.
-        self._filter_at = self._coulomb_at = replace(self._counter)
+        # Copies of the counter: as the filter was last predicted, and as the count started.
+        self._predicted_to = self._counted_from = replace(self._counter)
         self._block = BlockState()
         self._memory = EstimatorMemory()
         self._power = PowerModel(self.online, self.settings.limits)
@@ -313,7 +313,7 @@ class Estimator:
         if not is_above and not sample.current_a < low_a:
             return
         likelier = self.hypotheses.likelier
-        soc_pct, _ = likelier.soc_moments_after(*self._counter.since(self._filter_at))
+        soc_pct, _ = likelier.soc_moments_after(*self._counter.since(self._predicted_to))
         residual = likelier.row_residual(row, soc_pct)
         if (residual if is_above else -residual) > self.limits.residual_at_most:
             self._memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
@@ -359,8 +359,8 @@ class Estimator:
 
     def _predict(self, to: CoulombCounter) -> None:
         """Predict the filter to a count."""
-        self.hypotheses.predict(*to.since(self._filter_at))
-        self._filter_at = to
+        self.hypotheses.predict(*to.since(self._predicted_to))
+        self._predicted_to = to
 
     def _predict_to_now(self) -> None:
         """Predict the filter to the latest sample; the open block lies in part before it."""
@@ -387,7 +387,7 @@ class Estimator:
         self._start_count(soc_pct, std_pct)
 
     def _start_count(self, soc_pct: float, std_pct: float) -> None:
-        self._coulomb_at = replace(self._counter)
+        self._counted_from = replace(self._counter)
         self._memory.coulomb_start_pct = soc_pct + self._counter.discharged_pct
         self._memory.coulomb_var_pct2 = std_pct**2
 
@@ -415,17 +415,17 @@ class Estimator:
 
     def _filter_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation of the filter, counted to the latest sample [%]."""
-        soc_pct, std_pct = self.hypotheses.soc_after(*self._counter.since(self._filter_at))
+        soc_pct, std_pct = self.hypotheses.soc_after(*self._counter.since(self._predicted_to))
         return _clip(soc_pct), std_pct
 
     def _coulomb_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation by counting alone [%]; NaN until it has started."""
         memory, counter = self._memory, self._counter
-        seconds, _, gap_var_pct2 = counter.since(self._coulomb_at)
+        seconds, _, gap_var_pct2 = counter.since(self._counted_from)
         std_pct = count_std_pct(
             memory.coulomb_var_pct2 + gap_var_pct2,
             seconds,
-            counter.moved_pct - self._coulomb_at.moved_pct,
+            counter.moved_pct - self._counted_from.moved_pct,
         )
         return _clip(memory.coulomb_start_pct - counter.discharged_pct), std_pct
 
@@ -558,7 +558,7 @@ class Estimator:
         self._clock = replace(before._clock)
         settled = {"capacity_ah": self.capacity_ah, "gap_s": self.settings.gap_s}
         self._counter = replace(before._counter, **settled)
-        self._filter_at = replace(self._counter)
+        self._predicted_to = replace(self._counter)
         self._memory = memory = replace(before._memory, innovations=[])
         memory.mismatch_until_s = memory.coulomb_start_pct = math.nan
         memory.is_known = False
@@ -576,7 +576,11 @@ class Estimator:
         clock = replace(self._clock, shift_s=self._clock.shift_s + stamp_shift_s)
         parts = {
             "clock": asdict(clock),
-            "counts": [asdict(self._counter), asdict(self._filter_at), asdict(self._coulomb_at)],
+            "counts": [
+                asdict(self._counter),
+                asdict(self._predicted_to),
+                asdict(self._counted_from),
+            ],
             "block": vars(self._block),
             "memory": asdict(self._memory),
             "hypotheses": self.hypotheses.state(),
@@ -591,7 +595,7 @@ class Estimator:
         parts = json.loads(packed)
         self._clock = EstimatorClock(**parts["clock"] | {"age_s": age_s})
         counts = (CoulombCounter(**each) for each in parts["counts"])
-        self._counter, self._filter_at, self._coulomb_at = counts
+        self._counter, self._predicted_to, self._counted_from = counts
         self._counter.gap_s = self.settings.gap_s
         self._block = BlockState(**parts["block"])
         if self._block.sums is not None:

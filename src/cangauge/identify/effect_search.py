@@ -32,7 +32,7 @@ from cangauge.identify.least_squares import (
     solve_without,
 )
 from cangauge.identify.rows import FitRows, dequantize, start_of
-from cangauge.model.effects.base import Effect, Load, Signals, Values
+from cangauge.model.effects.base import Effect, Inputs, Signals, Values
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.prior import LOW_PASS_S, PackPrior
@@ -247,11 +247,11 @@ def linearize(
     true = plain.signals
     load_columns = voltage.load_columns(true.temperature_c, currents)
     drop_v = load_columns[:, 1:] @ voltage.load_coefficients[1:]
-    load = Load(true.time_s, true.current_a, true.temperature_c, drop_v)
+    inputs = Inputs(true.time_s, true.current_a, true.temperature_c, drop_v)
     soc = plain.soc_pct[rows.at]
 
-    def added_v(effect: Effect, values: Values, drop_v: FloatArray = load.drop_v) -> FloatArray:
-        return effect.added_v(load._replace(drop_v=drop_v), rows.at, soc, values, model)
+    def added_v(effect: Effect, values: Values, drop_v: FloatArray = inputs.drop_v) -> FloatArray:
+        return effect.added_v(inputs._replace(drop_v=drop_v), rows.at, soc, values, model)
 
     features_at = features(soc, true.temperature_c[rows.at], plain.currents_a)
     residual_v = plain.residual_v
@@ -261,8 +261,8 @@ def linearize(
         if effect.scales_drop and about.any():
             # Linear in the drop: the response to each current is that to a drop of 1 Ω.
             values = item.values(about)
-            nothing = added_v(effect, values, np.zeros_like(load.drop_v))
-            loads = load_features(load.temperature_c, currents)
+            nothing = added_v(effect, values, np.zeros_like(inputs.drop_v))
+            loads = load_features(inputs.temperature_c, currents)
             for place in range(1, loads.shape[1]):
                 response = added_v(effect, values, loads[:, place])
                 features_at[:, place - loads.shape[1]] += response - nothing

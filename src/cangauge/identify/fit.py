@@ -224,7 +224,7 @@ def _check_logs(logs: Sequence[Log]) -> None:
 def _capacity_of(
     logs: Sequence[Log], starts_pct: Sequence[float | None], stated: float | str | None
 ) -> float:
-    """Return the capacity: stated, from a full discharge, or from the logs' own SoC [Ah].
+    """Return the capacity [Ah]: as stated, from a full discharge, or from the logs' own SoC.
 
     Raises
     ------
@@ -284,7 +284,9 @@ def _chemistry_of(
     cells: int | None,
     capacity_ah: float,
 ) -> tuple[ChemistryName, str | None]:
-    """Return the chemistry, stated or by the volts per cell, and a remark where it was not stated.
+    """Return the chemistry, and what is to be said of it unless it was stated.
+
+    It follows from the volts per cell where the number of cells is known, and is oxide otherwise.
 
     Raises
     ------
@@ -297,8 +299,35 @@ def _chemistry_of(
             " curve beyond the logs. Or pass --chemistry lfp."
         )
         return stated or "oxide", None if stated else remark
+    volts, soc_pct = _mean_point(logs, starts_pct, capacity_ah)
+    volts_per_cell = volts / cells
+    unlikeness = {
+        name: min(
+            abs(volts_per_cell / float(np.interp(soc_pct, KNOTS_PCT, curve_v)) - 1.0)
+            for curve_v in (typical.curve_v, typical.other_v)
+        )
+        for name, typical in CHEMISTRIES.items()
+    }
+    likeliest = min(unlikeness, key=unlikeness.__getitem__)
+    name = likeliest if stated is None else stated
+    if unlikeness[name] > CELLS_TOLERANCE:
+        raise InputError(
+            f"{cells} cells would have {volts_per_cell:.2f} V each at {soc_pct:.0f} % SoC, which no"
+            f" {name} cell has",
+            field="cells",
+            value=cells,
+            cure="check the number of cells in series, and the chemistry",
+        )
+    remark = f"chemistry {name} by {volts_per_cell:.2f} V per cell, of {cells} cells"
+    return name, None if stated else remark
+
+
+def _mean_point(
+    logs: Sequence[Log], starts_pct: Sequence[float | None], capacity_ah: float
+) -> tuple[float, float]:
+    """Return mean voltage [V] and mean counted SoC [%] of some logs; about 50 % if unknown."""
     rows = sum(map(len, logs))
-    volts = sum(float(log.voltage_v.sum()) for log in logs) / rows / cells
+    total_v = sum(float(log.voltage_v.sum()) for log in logs)
     total_pct = 0.0
     for log, given_pct in zip(logs, starts_pct, strict=True):
         out_pct = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
@@ -306,23 +335,7 @@ def _chemistry_of(
         if given_pct is not None:
             row, start_pct = 0, given_pct
         total_pct += float(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0).sum())
-
-    def away(name: ChemistryName) -> float:
-        kind = CHEMISTRIES[name]
-        curves_v = np.array([kind.curve_v, kind.other_v])
-        typical = [np.interp(total_pct / rows, KNOTS_PCT, curve_v) for curve_v in curves_v]
-        return float(np.abs(volts / np.array(typical) - 1.0).min())
-
-    name = min(CHEMISTRIES, key=away) if stated is None else stated
-    if away(name) > CELLS_TOLERANCE:
-        raise InputError(
-            f"{cells} cells would have {volts:.2f} V each at {total_pct / rows:.0f} % SoC, which no"
-            f" {name} cell has",
-            field="cells",
-            value=cells,
-            cure="check the number of cells in series, and the chemistry",
-        )
-    return name, None if stated else f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"
+    return total_v / rows, total_pct / rows
 
 
 _Fitted = tuple[Model, PublishedFit, tuple[FloatArray, ...], Selected | None]

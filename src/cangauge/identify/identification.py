@@ -16,7 +16,7 @@ from cangauge._typing import FloatArray
 from cangauge.identify.effect_search import Selected
 from cangauge.identify.published import PublishedFit
 from cangauge.identify.rows import (
-    BLOCK,
+    CHUNK,
     SOC_SPAN_AT_LEAST_PCT,
     TEMPERATURE_SPAN_K,
     FitRows,
@@ -72,8 +72,8 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
     """
     driven = regenerated = square = 0.0
     for log in logs:
-        for first in range(0, len(log) - 1, BLOCK):
-            part = slice(first, first + BLOCK + 1)  # with the first row of the next one
+        for first in range(0, len(log) - 1, CHUNK):
+            part = slice(first, first + CHUNK + 1)  # with the first row of the next one
             step_s = np.diff(log.time_s[part])
             step_s[step_s > BRIDGE_S] = 0.0
             current_a = log.current_a[part]
@@ -125,8 +125,8 @@ def evaluate(model: ExtendedModel, rows: FitRows) -> LogFit:
     """Return the voltages and Newton inverse of a model on the rows of a log."""
     if not model.effects:
         columns = np.empty((3, len(rows)))
-        for part in rows.parts():
-            columns[:, part] = _predicted(model.model, rows.part(part))
+        for place, chunk in rows.chunks():
+            columns[:, place] = _predicted(model.model, chunk)
         return LogFit(rows, *columns)
     log = rows.log
     row, soc_pct = start_of(log)
@@ -167,10 +167,9 @@ def slope_resistances(
     total: Any = 0.0
     product: Any = 0.0
     for item in fits:
-        for part in item.rows.parts():
-            block = item.rows.part(part)
-            drop_v = block.voltage_v - item.pseudo_ocv_v[part]
-            table = np.column_stack([block.current_columns_a[:, : len(resistance_ohm)], drop_v])
+        for place, chunk in item.rows.chunks():
+            drop_v = chunk.voltage_v - item.pseudo_ocv_v[place]
+            table = np.column_stack([chunk.current_columns_a[:, : len(resistance_ohm)], drop_v])
             total = total + table.sum(axis=0)
             product = product + table[:, 0] @ table
     rows = sum(len(item.rows) for item in fits)

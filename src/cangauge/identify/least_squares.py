@@ -162,12 +162,11 @@ def log_sums(
             cure="check the SoC at the start (soc_pct, --initial-soc), or leave this log out",
         )
     moments: Any = 0.0
-    for part in rows.parts():
-        block = rows.part(part)
-        left = row_features(block) if columns is None else columns[part]
-        volts = block.voltage_v if voltage_v is None else voltage_v[part]
-        table = np.column_stack([left, np.ones(len(block)), volts])
-        moments = moments + table.T @ (table * weight[part, None])
+    for place, chunk in rows.chunks():
+        left = row_features(chunk) if columns is None else columns[place]
+        volts = chunk.voltage_v if voltage_v is None else voltage_v[place]
+        table = np.column_stack([left, np.ones(len(chunk)), volts])
+        moments = moments + table.T @ (table * weight[place, None])
     return LogSums(moments, total, float(weight @ rows.soc_pct) / total)
 
 

@@ -61,9 +61,8 @@ class PublishedEquation:
     def root(self, rows: FitRows) -> FloatArray:
         """Return the triangular factor of a log's [columns, voltage], shape (p + 1, p + 1)."""
         root = np.zeros((len(BASIS_NAMES) + 2 + len(self.delay_s),) * 2)
-        for part in rows.parts():
-            block = rows.part(part)
-            table = np.column_stack([self.columns(block), block.voltage_v])
+        for _, chunk in rows.chunks():
+            table = np.column_stack([self.columns(chunk), chunk.voltage_v])
             root = np.linalg.qr(np.vstack([root, table])).R
         return root
 

@@ -14,7 +14,7 @@ and is possible offline only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,8 +60,8 @@ STEPPED_SHARE = 0.5
 """A temperature that changes at this fraction of the rows or more is not quantized [-]."""
 
 
-BLOCK = 16_384
-"""Rows of a block: its 41 columns have 5 MB, and stay in the cache of a core."""
+CHUNK = 16_384
+"""Rows of a chunk: its 41 columns have 5 MB, and stay in the cache of a core."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,25 +132,24 @@ class FitRows:
         delayed = delayed_currents(log.time_s, log.current_a, self.delay_s, self.time_s)
         return np.concatenate([delayed, self.low_passed_a], axis=1)
 
-    def parts(self) -> list[slice]:
-        """Return the slices of all rows in blocks."""
-        return [slice(first, first + BLOCK) for first in range(0, len(self), BLOCK)]
-
-    def part(self, rows: slice) -> FitRows:
-        """Return some of the rows."""
-        return replace(
-            self,
-            at=self.at[rows],
-            soc_pct=self.soc_pct[rows],
-            dequantized_c=self.dequantized_c[rows],
-            low_passed_a=self.low_passed_a[rows],
-        )
+    def chunks(self) -> Iterator[tuple[slice, FitRows]]:
+        """Yield the rows in chunks of `CHUNK`, each with its place among all rows."""
+        for first in range(0, len(self), CHUNK):
+            place = slice(first, first + CHUNK)
+            chunk = replace(
+                self,
+                at=self.at[place],
+                soc_pct=self.soc_pct[place],
+                dequantized_c=self.dequantized_c[place],
+                low_passed_a=self.low_passed_a[place],
+            )
+            yield place, chunk
 
     def product(
         self, columns: Callable[[FitRows], FloatArray], coefficients: FloatArray
     ) -> FloatArray:
         """Return the voltage by columns of the rows and their coefficients, shape (m,)."""
-        return np.concatenate([columns(self.part(rows)) @ coefficients for rows in self.parts()])
+        return np.concatenate([columns(chunk) @ coefficients for _, chunk in self.chunks()])
 
 
 def fit_rows(

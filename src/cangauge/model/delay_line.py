@@ -62,7 +62,7 @@ def filled_at(
 SPACING_S = 0.009
 """Least distance of two kept samples with one between them [s]: bounds the memory at any rate."""
 
-BLOCK = 512
+DROPPED = 512
 """Number of stale currents that are dropped at once."""
 
 
@@ -103,8 +103,8 @@ class DelayLine:
             currents.pop()
         times.append(time_s)
         currents.append(current_a)
-        # In blocks: deleting the first element of a list at each push costs more.
-        if len(times) > BLOCK + 1 and times[BLOCK + 1] <= time_s - self._longest:
+        # Many together: deleting the first element of a list at each push costs more.
+        if len(times) > DROPPED + 1 and times[DROPPED + 1] <= time_s - self._longest:
             stale = bisect_right(times, time_s - self._longest) - 1
             del times[:stale]
             del currents[:stale]

@@ -21,7 +21,7 @@ from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import (
     Counting,
     Effect,
-    Load,
+    Inputs,
     Memories,
     Pack,
     Signals,
@@ -144,10 +144,10 @@ class ExtendedModel:
         columns = model.load_columns(temperature_c, currents)
         volts = columns @ model.load_coefficients
         drop_v = columns[:, 1:] @ model.load_coefficients[1:]
-        load = Load(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
+        inputs = Inputs(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
         over_soc = []
         for effect, values in effects:
-            drive = effect.drive(load, values, effect.context(values, model, pack))
+            drive = effect.drive(inputs, values, effect.context(values, model, pack))
             if drive is None:
                 continue
             if effect.uses_soc:
@@ -292,10 +292,10 @@ class OnlineModel:
         if not self.extended.effects:
             return
         drop_v = self.load[1:] @ self.load_coefficients[1:]
-        load = Load(at, now, np.array([known_c]), np.array([drop_v]))
+        inputs = Inputs(at, now, np.array([known_c]), np.array([drop_v]))
         over = 0
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
-            drive = effect.drive(load, values, context)
+            drive = effect.drive(inputs, values, context)
             place = 1 + over if effect.uses_soc else 0
             over += effect.uses_soc
             if drive is not None:

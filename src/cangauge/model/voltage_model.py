@@ -4,7 +4,9 @@
 
 g is the pseudo-OCV. Im are the current at several delays, followed by the current low-passed with
 several time constants. Positive current discharges, so the resistances Rm are negative. The last
-term, of factor b, scales the resistances R⁰ by Arrhenius' law a(T); without it R is constant.
+term, of factor b, scales the resistances R⁰ by Arrhenius' law a(T); without it R is constant. All
+terms beside g are linear, U = g(S) + L·θ: a *load row* L, which holds T − T_r, the currents and
+Arrhenius' change, times the *load coefficients* θ = (kt, R1 … RM, b).
 
 Two curves have the same interface. `HermiteCurve` interpolates values at knots. `PublishedCurve`
 is the published equation,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stepping import MODEL, PACK, irregular_signals, online_of, step_through
 
-from cangauge.model.effects.base import Load, Signals, Values
+from cangauge.model.effects.base import Inputs, Signals, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.first_order import Lag, decaying_sum, low_passed
@@ -55,8 +55,8 @@ def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
     """The extra voltage [V]; parameters not given are neutral."""
     effect = LIBRARY[effect_id]
     values = {**effect.neutral(PACK), **values}
-    load = Load(state.time_s, state.current_a, state.temperature_c, state.drop_v)
-    drive = effect.drive(load, values, effect.context(values, MODEL, PACK))
+    inputs = Inputs(state.time_s, state.current_a, state.temperature_c, state.drop_v)
+    drive = effect.drive(inputs, values, effect.context(values, MODEL, PACK))
     assert drive is not None
     return drive * effect.over_soc(state.soc_pct, values, MODEL)
 

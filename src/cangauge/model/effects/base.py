@@ -173,7 +173,7 @@ class Signals(NamedTuple):
         return cls(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
 
 
-class Load(NamedTuple):
+class Inputs(NamedTuple):
     """Inputs of an added voltage, shape (n,) each, after correction."""
 
     time_s: FloatArray
@@ -281,7 +281,7 @@ class Effect:
     count : callable
         (counting, values) → how charge is counted with the effect.
     drive : callable
-        (load, values, context) → added voltage [V], or its part besides `over_soc`, shape (n,);
+        (inputs, values, context) → added voltage [V], or its part besides `over_soc`, shape (n,);
         None if it adds none. Rows come once and in order: the memory is advanced.
     over_soc : callable
         (soc_pct, values, model) → factor on `drive` at SoC [%] of shape (n,).
@@ -306,7 +306,7 @@ class Effect:
     separated_by: str
     correct: Callable[[Signals, Values, Context], Signals] = same_signals
     count: Callable[[Counting, Values], Counting] = same_count
-    drive: Callable[[Load, Values, Context], FloatArray | None] = none
+    drive: Callable[[Inputs, Values, Context], FloatArray | None] = none
     over_soc: Callable[[FloatArray, Values, VoltageModel], FloatArray | float] = at_every_soc
     memory: Callable[[Values, Pack], Memories] = no_memory
     core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = none
@@ -345,7 +345,7 @@ class Effect:
 
     def added_v(
         self,
-        load: Load,
+        inputs: Inputs,
         rows: NDArray[np.intp] | slice,
         soc_pct: FloatArray,
         values: Values,
@@ -355,7 +355,7 @@ class Effect:
 
         Parameters
         ----------
-        load : Load
+        inputs : Inputs
             Of the whole log.
         rows : array of int, shape (m,), or slice
         soc_pct : array of shape (m,)
@@ -363,7 +363,7 @@ class Effect:
         values : dict of str to float
         model : ExtendedModel
         """
-        drive = self.drive(load, values, self.context(values, model.model, model.pack))
+        drive = self.drive(inputs, values, self.context(values, model.model, model.pack))
         if drive is None:
             return np.zeros_like(soc_pct)
         return np.asarray(drive[rows] * self.over_soc(soc_pct, values, model.model))

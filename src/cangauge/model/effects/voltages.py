@@ -14,7 +14,7 @@ from cangauge.model.effects.base import (
     Context,
     CoreForm,
     Effect,
-    Load,
+    Inputs,
     Memories,
     Pack,
     Parameter,
@@ -47,20 +47,20 @@ def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
     return np.asarray(np.exp(activation_k * (inverse_k(temperature_c) - inverse_k(REFERENCE_C))))
 
 
-def drop(load: Load, values: Values, at: Context) -> FloatArray:
+def drop(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return the drop over the resistance."""
-    return load.scaled_drop_v(values["delayed"], at.pack)
+    return inputs.scaled_drop_v(values["delayed"], at.pack)
 
 
-def grown_drop(load: Load, values: Values, at: Context) -> FloatArray:
+def grown_drop(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return a share of the drop."""
-    return values["share"] * drop(load, values, at)
+    return values["share"] * drop(inputs, values, at)
 
 
-def colder_drop(load: Load, values: Values, at: Context) -> FloatArray:
+def colder_drop(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return the drop's growth in the cold."""
-    colder = inverse_k(load.temperature_c) - inverse_k(values["reference_c"])
-    return grown_drop(load, values, at) * np.expm1(values["activation_k"] * colder)
+    colder = inverse_k(inputs.temperature_c) - inverse_k(values["reference_c"])
+    return grown_drop(inputs, values, at) * np.expm1(values["activation_k"] * colder)
 
 
 def colder_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
@@ -77,9 +77,9 @@ def ends_of_soc(soc_pct: FloatArray, values: Values, _: VoltageModel) -> FloatAr
     return np.asarray(rise + values["at_full"] * np.exp((soc - 100.0) / width))
 
 
-def drop_while_charging(load: Load, values: Values, _: Context) -> FloatArray:
+def drop_while_charging(inputs: Inputs, values: Values, _: Context) -> FloatArray:
     """Return the drop of charging current over a resistance."""
-    return -values["charging_ohm"] * np.minimum(load.current_a, 0.0)
+    return -values["charging_ohm"] * np.minimum(inputs.current_a, 0.0)
 
 
 def first_time(*_: object) -> Memories:
@@ -87,21 +87,21 @@ def first_time(*_: object) -> Memories:
     return (First(),)
 
 
-def drop_after_step(load: Load, values: Values, at: Context) -> FloatArray:
+def drop_after_step(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return the drop over a resistance that is added at a moment."""
-    after = load.time_s - at.memory[0].of(load.time_s) >= values["start_s"]
-    return np.where(after, -values["step_ohm"] * load.current_a, 0.0)
+    after = inputs.time_s - at.memory[0].of(inputs.time_s) >= values["start_s"]
+    return np.where(after, -values["step_ohm"] * inputs.current_a, 0.0)
 
 
 # --- dynamics
 
 
-def bend(load: Load, values: Values, at: Context) -> FloatArray:
+def bend(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return the bent part of charge transfer."""
-    per_a = 0.5 / values["exchange_a"] * arrhenius(load.temperature_c, values["activation_k"])
+    per_a = 0.5 / values["exchange_a"] * arrhenius(inputs.temperature_c, values["activation_k"])
     zero_a = at.pack.capacity_ah
     slope = values["bend_only"] * np.arcsinh(zero_a * per_a) / zero_a
-    bent = np.arcsinh(load.current_a * per_a) - slope * load.current_a
+    bent = np.arcsinh(inputs.current_a * per_a) - slope * inputs.current_a
     return np.asarray(-values["scale_v"] * bent)
 
 
@@ -116,10 +116,10 @@ def rc_memory(values: Values, _: Pack) -> Memories:
     return (Lag(values["tau_s"], 0.0, rest_s=BRIDGE_S),)
 
 
-def rc_voltage(load: Load, values: Values, at: Context) -> FloatArray:
+def rc_voltage(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return the voltage of an RC element."""
-    volts = -values["ohm"] * at.memory[0].step(load.time_s, load.current_a)
-    return np.asarray(volts * arrhenius(load.temperature_c, values["activation_k"]))
+    volts = -values["ohm"] * at.memory[0].step(inputs.time_s, inputs.current_a)
+    return np.asarray(volts * arrhenius(inputs.temperature_c, values["activation_k"]))
 
 
 def rc_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
@@ -159,9 +159,9 @@ def hysteresis_memory(values: Values, pack: Pack) -> Memories:
     return (Turned(travel_as(values, pack)),)
 
 
-def hysteresis_voltage(load: Load, values: Values, at: Context) -> FloatArray:
+def hysteresis_voltage(inputs: Inputs, values: Values, at: Context) -> FloatArray:
     """Return the half width times the state."""
-    return np.asarray(values["half_width_v"] * at.memory[0].step(load.time_s, load.current_a))
+    return np.asarray(values["half_width_v"] * at.memory[0].step(inputs.time_s, inputs.current_a))
 
 
 def hysteresis_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
@@ -169,9 +169,9 @@ def hysteresis_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
     return CoreForm("hysteresis", (values["half_width_v"], travel_as(values, pack)))
 
 
-def warmer_k(load: Load, _: Values, at: Context) -> FloatArray:
+def warmer_k(inputs: Inputs, _: Values, at: Context) -> FloatArray:
     """Return the temperature above T_r [K]."""
-    return np.asarray(np.clip(load.temperature_c, *PLAUSIBLE_C) - at.model.loads.t_ref_c)
+    return np.asarray(np.clip(inputs.temperature_c, *PLAUSIBLE_C) - at.model.loads.t_ref_c)
 
 
 def entropic_v_per_k(soc_pct: FloatArray, values: Values, _: VoltageModel) -> FloatArray:
@@ -181,9 +181,9 @@ def entropic_v_per_k(soc_pct: FloatArray, values: Values, _: VoltageModel) -> Fl
     return np.asarray(shape + values["curve_v_per_k"] * (1.5 * x * x - 0.5))
 
 
-def fraction(load: Load, values: Values, _: Context) -> FloatArray:
+def fraction(inputs: Inputs, values: Values, _: Context) -> FloatArray:
     """Return the fraction of weak cells, at every row."""
-    return np.full_like(load.current_a, values["fraction"])
+    return np.full_like(inputs.current_a, values["fraction"])
 
 
 def ahead(values: Values) -> float:
