@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,54 @@ if TYPE_CHECKING:
 SAME_SUM = 0.02
 """Largest difference between the sum of the cells and the pack's voltage, of the latter: a cell
 more or less in 16 makes three times as much."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedOptions:
+    """The options of the published equation."""
+
+    delays: Annotated[
+        str | None,
+        option(
+            "--delays",
+            "S,S,…",
+            "Delays of the current [s], by default 0,10,30,70; with --equation published.",
+        ),
+    ] = None
+    epsilon: Annotated[
+        float | None,
+        option(
+            "--epsilon",
+            "E",
+            "Margin ε of the scaled SoC, by default 0.05; with --equation published.",
+            within=(0.0001, 0.49),
+        ),
+    ] = None
+    t_ref: Annotated[
+        float | None,
+        option(
+            "--t-ref",
+            "C",
+            "Reference temperature T_r, by default 20; with --equation published.",
+            within=(-60, 120),
+            unit="°C",
+        ),
+    ] = None
+
+    def given(self, equation: str) -> dict[str, Any]:
+        """Return the arguments of `fit` that are given; raise InputError for another equation."""
+        delay_s = None if self.delays is None else _delays_s(self.delays)
+        by_flag = {
+            "--delays": ("delay_s", delay_s),
+            "--epsilon": ("epsilon", self.epsilon),
+            "--t-ref": ("t_ref_c", self.t_ref),
+        }
+        given = {flag: each for flag, each in by_flag.items() if each[1] is not None}
+        if equation != "published" and given:
+            problem = "belongs to the published equation"
+            cure = "add --equation published, or omit it"
+            raise InputError(problem, field=next(iter(given)), cure=cure)
+        return dict(given.values())
 
 
 @command()
@@ -101,33 +150,6 @@ def fit_command(
             unit="Hz",
         ),
     ] = 1.0,
-    delays: Annotated[
-        str | None,
-        option(
-            "--delays",
-            "S,S,…",
-            "Delays of the current [s], by default 0,10,30,70; with --equation published.",
-        ),
-    ] = None,
-    epsilon: Annotated[
-        float | None,
-        option(
-            "--epsilon",
-            "E",
-            "Margin ε of the scaled SoC, by default 0.05; with --equation published.",
-            within=(0.0001, 0.49),
-        ),
-    ] = None,
-    t_ref: Annotated[
-        float | None,
-        option(
-            "--t-ref",
-            "C",
-            "Reference temperature T_r, by default 20; with --equation published.",
-            within=(-60, 120),
-            unit="°C",
-        ),
-    ] = None,
     effects: Annotated[
         list[str] | None,
         option(
@@ -137,6 +159,7 @@ def fit_command(
             " that lower the error of left-out logs significantly. Default: none.",
         ),
     ] = None,
+    published: PublishedOptions,
     reading: ReadingOptions,
     report: Annotated[Path | None, REPORT] = None,
     json_output: Annotated[bool, JSON] = False,
@@ -164,36 +187,21 @@ def fit_command(
     """
     from cangauge.identify.fit import fit
 
-    if initial_soc is not None and len(initial_soc) not in {1, len(logs)}:
-        raise InputError(
-            f"{len(initial_soc)} values for {len(logs)} logs",
-            field="--initial-soc",
-            cure="give one for all, or one for each log in order (auto where it is unknown)",
-        )
-    starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
-    published: dict[str, Any] = {
-        "delay_s": None if delays is None else _delays_s(delays),
-        "epsilon": epsilon,
-        "t_ref_c": t_ref,
-    }
-    published = {name: value for name, value in published.items() if value is not None}
-    if equation == "knots" and published:
-        option = {"delay_s": "--delays", "epsilon": "--epsilon", "t_ref_c": "--t-ref"}
-        problem, cure = "belongs to the published equation", "add --equation published, or omit it"
-        raise InputError(problem, field=option[next(iter(published))], cure=cure)
+    starts = _starts_pct(initial_soc, len(logs))
+    of_equation = published.given(equation)
     check_outputs([output, report], logs)
     with progress("cangauge.identify") as show:
         recorded = reading.load_all(logs, show)
         result = fit(
             recorded,
             capacity_ah=capacity_ah,
-            initial_soc_pct=starts if len(starts) > 1 else starts[0],
+            initial_soc_pct=starts,
             equation=equation,
             chemistry=chemistry,
             cells=cells or _cells_of(recorded[0], reading),
             rate_hz=rate_hz,
             effects=effects,
-            **published,
+            **of_equation,
         )
         show("writing")
         texts = {output: result.model.to_json()}
@@ -203,6 +211,20 @@ def fit_command(
     found = result.to_dict() | {"assumed": assumed_of(recorded)}
     files = {"model": output, "report": report}
     finish(found, partial(_show, result), files, as_json=json_output)
+
+
+def _starts_pct(given: list[Any] | None, logs: int) -> Any:
+    """Return the SoC at the start of all logs, or of each [%]; None where it is unknown."""
+    starts = [None if each == "auto" else each for each in given or ["auto"]]
+    if len(starts) == 1:
+        return starts[0]
+    if len(starts) != logs:
+        raise InputError(
+            f"{len(starts)} values for {logs} logs",
+            field="--initial-soc",
+            cure="give one for all, or one for each log in order (auto where it is unknown)",
+        )
+    return starts
 
 
 def _cells_of(log: Log, reading: ReadingOptions) -> int | None:
