@@ -217,6 +217,13 @@ class Linearized:
         """All columns, shape (m, BASE + e)."""
         return np.column_stack([self.features, self.columns])
 
+    def explained_v(self, coefficients: FloatArray, amplitudes: FloatArray) -> FloatArray:
+        """Return what the columns are to explain [V], shape (m,): the linear part and the residual.
+
+        `coefficients` of shape (BASE,) and `amplitudes` of shape (e,) are those of the model.
+        """
+        return self.features @ coefficients + self.columns @ amplitudes + self.residual_v
+
 
 def linearize(
     model: ExtendedModel, rows: FitRows, selected: Selected, amplitudes: FloatArray

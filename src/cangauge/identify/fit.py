@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from typing import Any, Final, Literal, NamedTuple, get_args
+from dataclasses import replace
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -17,12 +18,10 @@ from cangauge.errors import InputError, require_choice, require_number
 from cangauge.identify.effect_search import Search, Selected, linearize, parse_effect_ids
 from cangauge.identify.identification import (
     Identification,
-    energy_balance,
     evaluate,
     remarks_on_effects,
     remarks_on_logs,
     remarks_on_rows,
-    slope_resistances,
 )
 from cangauge.identify.least_squares import (
     BASE,
@@ -118,61 +117,38 @@ def fit(
     >>> fitted = fit("trip.csv", capacity_ah=60.0, cells=96)  # doctest: +SKIP
     >>> fitted.model.save("pack.json")  # doctest: +SKIP
     """
-    require_choice(equation, get_args(Equation), "equation")
-    require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
-    if capacity_ah not in (None, "from-soc"):
-        require_number(capacity_ah, "capacity_ah")
-    if cells is not None and not cells >= 1:
-        raise InputError("a pack has at least one cell", field="cells", value=cells)
-    if not 0.0 < epsilon < 0.5:
-        raise InputError(
-            "must lie between 0 and 0.5, or the logarithms diverge",
-            field="epsilon",
-            value=epsilon,
-            cure="the published value is 0.05",
-        )
+    _check_given(equation, chemistry, capacity_ah, cells)
+    published_equation = PublishedEquation(epsilon, t_ref_c, tuple(delay_s))
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
     stated_pct = given_starts(initial_soc_pct, len(recorded))
     capacity_ah = _capacity_of(recorded, stated_pct, capacity_ah)
-    unstated = [log for log, start in zip(recorded, stated_pct, strict=True) if start is None]
-    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
     effect_ids = _effect_ids(effects, equation)
     chemistry, remark = _chemistry_of(recorded, stated_pct, chemistry, cells, capacity_ah)
+    pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
+    options = {
+        "capacity_ah": capacity_ah,
+        "rate_hz": rate_hz,
+        "chemistry": chemistry,
+        "equation": equation,
+        "initial_soc_pct": stated_pct[0] if len({*stated_pct}) == 1 else None,
+        "effects": ", ".join(effect_ids) or None,
+    }
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
-        pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
         starts = find_starts(recorded, stated_pct, pack)
         known = [start.log for start in starts]
         on_logs = remarks_on_logs(starts, recorded, delay_s, capacity_ah)  # before rows need memory
         delays = DELAYS_S if equation == "knots" else usable_delays(known, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in known]
         _check_rows(rows)
-        options = {
-            "capacity_ah": capacity_ah,
-            "rate_hz": rate_hz,
-            "chemistry": chemistry,
-            "equation": equation,
-            "initial_soc_pct": stated_pct[0] if len({*stated_pct}) == 1 else None,
-            "effects": ", ".join(effect_ids) or None,
-        }
-        fields: dict[str, Any] = {
-            "name": common_name([log.name for log in recorded]),
-            "chemistry": chemistry,
-            "cells": cells,
-            "capacity_ah": capacity_ah,
-            "rate_hz": rate_hz,
-            "temperature_source": recorded[0].temperature_source,
-            "range": ranges_of(rows),
-            "made": _made_of(rows, options),
-        }
+        fields = _fields(recorded, rows, cells, options)
         if equation == "knots":
             fitted = _fit_knots(rows, pack, effect_ids, fields)
         else:
-            fitted = _fit_published(rows, PublishedEquation(epsilon, t_ref_c, delays), fields)
+            fitted = _fit_published(rows, replace(published_equation, delay_s=delays), fields)
         model, published, held_out_error_v, selected = fitted
         extended = model.extended_model()
         fits = tuple(evaluate(extended, item) for item in rows)
-    slope, expected = slope_resistances(fits, extended.model.loads.resistance_ohm)
     return Identification(
         model=model,
         published=published,
@@ -180,9 +156,6 @@ def fit(
         effects=selected,
         starts=tuple(starts),
         fits=fits,
-        energy=energy_balance(known, slope),
-        slope_ohm=slope,
-        slope_expected_ohm=expected,
         remarks=(
             *([remark] if remark else []),
             *remarks_on_rows(rows),
@@ -190,6 +163,17 @@ def fit(
             *remarks_on_effects(selected, model),
         ),
     )
+
+
+def _check_given(
+    equation: str, chemistry: str | None, capacity_ah: float | str | None, cells: int | None
+) -> None:
+    require_choice(equation, get_args(Equation), "equation")
+    require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
+    if capacity_ah not in (None, "from-soc"):
+        require_number(capacity_ah, "capacity_ah")
+    if cells is not None and not cells >= 1:
+        raise InputError("a pack has at least one cell", field="cells", value=cells)
 
 
 def _check_logs(logs: Sequence[Log]) -> None:
@@ -229,7 +213,7 @@ def _capacity_of(
     Raises
     ------
     InputError
-        If the capacity is not positive.
+        If it is not positive, or the SoC of logs without a stated start contradicts it.
     """
     if stated is None:
         capacity_ah = capacity_from_full_discharge(logs, starts_pct)
@@ -244,6 +228,8 @@ def _capacity_of(
             value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )
+    unstated = [log for log, start in zip(logs, starts_pct, strict=True) if start is None]
+    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
     return capacity_ah
 
 
@@ -270,11 +256,26 @@ def _check_rows(rows: Sequence[FitRows]) -> None:
         )
 
 
-def _made_of(rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
-    """Return how a model was made."""
-    logs = [SourceLog(name=item.name, rows=len(item), sha256=log_sha256(item.log)) for item in rows]
-    fingerprint = text_sha256("".join(log.sha256 for log in logs))
-    return Made(by=f"cangauge {__version__}", options=options, logs=logs, fingerprint=fingerprint)
+def _fields(
+    logs: Sequence[Log], rows: Sequence[FitRows], cells: int | None, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the fields of a model file that are known before the fit."""
+    used = [SourceLog(name=item.name, rows=len(item), sha256=log_sha256(item.log)) for item in rows]
+    return {
+        "name": common_name([log.name for log in logs]),
+        "chemistry": options["chemistry"],
+        "cells": cells,
+        "capacity_ah": options["capacity_ah"],
+        "rate_hz": options["rate_hz"],
+        "temperature_source": logs[0].temperature_source,
+        "range": ranges_of(rows),
+        "made": Made(
+            by=f"cangauge {__version__}",
+            options=options,
+            logs=used,
+            fingerprint=text_sha256("".join(log.sha256 for log in used)),
+        ),
+    }
 
 
 def _chemistry_of(
@@ -342,76 +343,63 @@ _Fitted = tuple[Model, PublishedFit, tuple[FloatArray, ...], Selected | None]
 """Model, published equation, errors of left-out logs, and effects if any were asked for."""
 
 
-class _Joint(NamedTuple):
-    """Curve of knots, and effects if any, of all logs together and with each left out."""
-
-    solution: Solution
-    without: Sequence[Solution]
-    rows: Sequence[FitRows]
-    tables: Sequence[FloatArray] = ()
-    voltage_v: Sequence[FloatArray] = ()
-    """With effects: columns of the moments, and what they explain, on the rows of each log."""
-    effects: tuple[tuple[Effect, Values], ...] = ()
-
-    def held_out_v(self) -> tuple[FloatArray, ...]:
-        """Return the error of each log by the solution without it [V]; see `_comparable`."""
-        errors_v = []
-        for number, other in enumerate(self.without):
-            coefficients, rows = other.select.T @ other.coefficients, self.rows[number]
-            if self.tables:
-                error_v = self.voltage_v[number] - self.tables[number] @ coefficients
-            else:
-                error_v = rows.voltage_v - rows.product(row_features, coefficients)
-            errors_v.append(error_v)
-        return _comparable(self.rows, errors_v)
-
-
 def _fit_knots(
     rows: Sequence[FitRows],
     pack: PackPrior,
     effect_ids: Sequence[str],
     fields: dict[str, Any],
 ) -> _Fitted:
+    """Return the fit of a curve of knots, with the effects that are asked for."""
     equation = PublishedEquation()
     published = equation.fit(rows, [equation.root(item) for item in rows])
     if usable_delays([item.log for item in rows], DELAYS_S) == DELAYS_S and published.identified:
         fields = fields | {"published": published.fields()}
-    sums = [log_sums(item, pack.chemistry) for item in rows]
-    joint = _Joint(*solve_scaled(sums, pack), rows)
+    solution, without = solve_scaled([log_sums(item, pack.chemistry) for item in rows], pack)
+    errors_v = _comparable(
+        rows,
+        [
+            item.voltage_v - item.product(row_features, other.of_columns)
+            for item, other in zip(rows, without, strict=False)  # none for too few logs
+        ],
+    )
+    effects: tuple[tuple[Effect, Values], ...] = ()
     selected: Selected | None = None
     if effect_ids:
-        plain = knots_model(joint.solution, fields).extended_model()
-        search = Search(plain, rows, pack, effect_ids)
+        search = Search(knots_model(solution, fields).extended_model(), rows, pack, effect_ids)
         while (selected := search.select()).chosen:
-            with_effects = _with_effects(joint, selected, pack, fields)
-            at_bound = selected.at_bound(with_effects.solution)
+            with_effects = _with_effects(solution, rows, selected, pack, fields)
+            at_bound = selected.at_bound(with_effects[0])
             if not at_bound:
-                joint = with_effects
+                solution, effects, errors_v = with_effects
                 break
             search.refused += at_bound
-    errors_v = joint.held_out_v()
-    fields = fields | {"effects": effect_entries(joint.effects)}
-    model = knots_model(joint.solution, fields, errors_v, joint.rows)
+    fields = fields | {"effects": effect_entries(effects)}
+    model = knots_model(solution, fields, errors_v, rows)
     return model, published, errors_v, selected
 
 
 def _with_effects(
-    plain: _Joint,
+    plain: Solution,
+    rows: Sequence[FitRows],
     selected: Selected,
     pack: PackPrior,
     fields: dict[str, Any],
-) -> _Joint:
-    """Return the fit with the selected effects: Gauss–Newton from `plain`, without effects."""
-    solution, std = plain.solution, selected.amplitude_std
+) -> tuple[Solution, tuple[tuple[Effect, Values], ...], tuple[FloatArray, ...]]:
+    """Fit the selected effects too, by Gauss–Newton steps from the solution without effects.
+
+    Returns
+    -------
+    solution : Solution
+    effects : tuple of (Effect, values)
+    errors_v : tuple of array of shape (m,)
+        Errors of left-out logs [V].
+    """
+    solution, std = plain, selected.amplitude_std
     extended = knots_model(solution, fields).extended_model()
     amplitudes = np.zeros(std.size)
     for _ in range(RELINEARIZED):
-        coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
-        about = [linearize(extended, item, selected, amplitudes) for item in plain.rows]
-        volts = [
-            item.features @ coefficients + item.columns @ amplitudes + item.residual_v
-            for item in about
-        ]
+        about = [linearize(extended, item, selected, amplitudes) for item in rows]
+        volts = [item.explained_v(solution.of_columns[:BASE], amplitudes) for item in about]
         tables = [item.table for item in about]
         sums = [
             log_sums(item.rows, pack.chemistry, table, volts_of_log)
@@ -423,7 +411,11 @@ def _with_effects(
         effects = selected.effects(solution)
         voltage = knots_model(solution, fields).voltage_model()
         extended = ExtendedModel(voltage, pack.capacity_ah, effects)
-    return _Joint(solution, without, [item.rows for item in about], tables, volts, effects)
+    errors_v = [
+        volts_of_log - table @ other.of_columns
+        for volts_of_log, table, other in zip(volts, tables, without, strict=False)
+    ]
+    return solution, effects, _comparable([item.rows for item in about], errors_v)
 
 
 def knots_model(

@@ -192,11 +192,6 @@ class Identification:
     fewer than three logs."""
     published: PublishedFit
     """The published equation on the same rows."""
-    energy: Energy
-    slope_ohm: float
-    """Regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
-    slope_expected_ohm: float
-    """What the model's resistances expect of it [Ω]."""
     remarks: tuple[str, ...] = ()
     effects: Selected | None = None
     """Selected effects; None if none were asked for."""
@@ -210,6 +205,25 @@ class Identification:
     def voltage_model(self) -> VoltageModel:
         """The model's equation, without effects."""
         return self.model.voltage_model()
+
+    @cached_property
+    def _slopes_ohm(self) -> tuple[float, float]:
+        return slope_resistances(self.fits, self.voltage_model.loads.resistance_ohm)
+
+    @property
+    def slope_ohm(self) -> float:
+        """Regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
+        return self._slopes_ohm[0]
+
+    @property
+    def slope_expected_ohm(self) -> float:
+        """What the model's resistances expect of it [Ω]."""
+        return self._slopes_ohm[1]
+
+    @property
+    def energy(self) -> Energy:
+        """Energy at the pack's terminals over all logs."""
+        return energy_balance(self.logs, self.slope_ohm)
 
     @property
     def verdict(self) -> str:

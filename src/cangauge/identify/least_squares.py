@@ -182,6 +182,11 @@ class Solution(Distribution):
 
     select: FloatArray
 
+    @property
+    def of_columns(self) -> FloatArray:
+        """Coefficients of the columns of the moments, shape (q − 2,)."""
+        return np.asarray(self.select.T @ self.coefficients)
+
     def mean_error(self, sums: LogSums) -> tuple[float, float]:
         """Return the mean residual of a log [V], and its variance by the coefficients [V²]."""
         row = self.select @ (sums.moments[:-2, -2] / sums.weight)
@@ -211,7 +216,7 @@ class Solution(Distribution):
 
     def square_error(self, sums: LogSums) -> float:
         """Return the mean square residual of a log, its level included [V²]."""
-        back = np.r_[self.select.T @ self.coefficients, 0.0, -1.0]
+        back = np.r_[self.of_columns, 0.0, -1.0]
         return float(back @ sums.moments @ back) / sums.weight
 
 

@@ -52,6 +52,15 @@ class PublishedEquation:
     t_ref_c: float = REFERENCE_C
     delay_s: Sequence[float] = DELAYS_S
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.epsilon < 0.5:
+            raise InputError(
+                "must lie between 0 and 0.5, or the logarithms diverge",
+                field="epsilon",
+                value=self.epsilon,
+                cure="the published value is 0.05",
+            )
+
     def columns(self, rows: FitRows) -> FloatArray:
         """Return the columns of k0 … k7, kt, R1 … Rn, shape (m, p)."""
         warmer = rows.dequantized_c - self.t_ref_c
