@@ -23,6 +23,7 @@ from cangauge.errors import InputError
 from cangauge.identify.least_squares import (
     LOGS_AT_LEAST,
     LogSums,
+    N,
     P,
     Solution,
     features,
@@ -242,49 +243,45 @@ def linearize(
     voltage, log = model.model, rows.log
     row, start_pct = start_of(log)
     signals = Signals.of(dequantize(log))
-    currents = voltage.currents(log.time_s, log.current_a, slice(None))
-    # Added voltages are linear in their amplitudes, so their columns give them too.
-    correcting = tuple(item for item in model.effects if not item[0].adds_voltage)
+    currents_a = voltage.currents(log.time_s, log.current_a, slice(None))
 
     def predict(effects: tuple[tuple[Effect, Values], ...]) -> Prediction:
         changed = replace(model, effects=effects)
-        return changed.predict(signals, start_pct, rows.at, initial_row=row, currents_a=currents)
+        return changed.predict(signals, start_pct, rows.at, initial_row=row, currents_a=currents_a)
 
+    # Added voltages are linear in their amplitudes, so their columns give them too.
+    correcting = tuple(item for item in model.effects if not item[0].adds_voltage)
     plain = predict(correcting)
-    true = plain.signals
-    load_columns = voltage.load_columns(true.temperature_c, currents)
+    true, soc_pct = plain.signals, plain.soc_pct[rows.at]
+    load_columns = voltage.load_columns(true.temperature_c, currents_a)
     drop_v = load_columns[:, 1:] @ voltage.load_coefficients[1:]
     inputs = Inputs(true.time_s, true.current_a, true.temperature_c, drop_v)
-    soc = plain.soc_pct[rows.at]
 
-    def added_v(effect: Effect, values: Values, drop_v: FloatArray = inputs.drop_v) -> FloatArray:
-        return effect.added_v(inputs._replace(drop_v=drop_v), rows.at, soc, values, model)
+    def added_v(effect: Effect, values: Values, drop_v: FloatArray = drop_v) -> FloatArray:
+        return effect.added_v(inputs._replace(drop_v=drop_v), rows.at, soc_pct, values, model)
 
-    features_at = features(soc, true.temperature_c[rows.at], plain.currents_a)
-    residual_v = plain.residual_v
-    columns = [np.empty((len(rows), 0))]
-    for item, about in selected.with_parts(amplitudes):
+    features_at = features(soc_pct, true.temperature_c[rows.at], plain.currents_a)
+    columns, residual_v = [np.empty((len(rows), 0))], plain.residual_v
+    for item, amounts in selected.with_parts(amplitudes):
         effect = item.effect
-        if effect.scales_drop and about.any():
+        if effect.scales_drop and amounts.any():
             # Linear in the drop: the response to each current is that to a drop of 1 Ω.
-            values = item.values(about)
-            nothing = added_v(effect, values, np.zeros_like(inputs.drop_v))
-            loads = load_features(inputs.temperature_c, currents)
-            for place in range(1, loads.shape[1]):
-                response = added_v(effect, values, loads[:, place])
-                features_at[:, place - loads.shape[1]] += response - nothing
-        for number, step in enumerate(item.steps.tolist()):
-            one = step * (np.arange(about.size) == number)
+            values = item.values(amounts)
+            nothing_v = added_v(effect, values, np.zeros_like(drop_v))
+            drops_v = load_features(true.temperature_c, currents_a)[:, 1:].T
+            for place, drop_of_1_ohm_v in enumerate(drops_v, start=N + 1):
+                features_at[:, place] += added_v(effect, values, drop_of_1_ohm_v) - nothing_v
+        others = tuple(other for other in correcting if other[0] is not effect)
+        for amount, step, one in zip(amounts, item.steps, np.diag(item.steps), strict=True):
             if effect.adds_voltage:
                 change_v = added_v(effect, item.values(one))
-                residual_v = residual_v - change_v * (about[number] / step)
+                residual_v = residual_v - change_v * (amount / step)
             else:
-                others = tuple(other for other in correcting if other[0] is not effect)
-                changed = (*others, (effect, item.values(about + one)))
-                change_v = plain.residual_v - predict(changed).residual_v
+                changed = predict((*others, (effect, item.values(amounts + one))))
+                change_v = plain.residual_v - changed.residual_v
             columns.append(change_v / step)
     table = np.column_stack(columns)
-    return Linearized(replace(rows, soc_pct=soc), features_at, table, residual_v)
+    return Linearized(replace(rows, soc_pct=soc_pct), features_at, table, residual_v)
 
 
 def offered(effect_ids: Sequence[str], model: ExtendedModel) -> list[EffectCandidate]:

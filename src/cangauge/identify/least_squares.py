@@ -260,35 +260,80 @@ def solve(
     for _ in range(2):  # the column of b needs the resistances: twice
         arrhenius_ohm = ohm
         select = _selection(arrhenius_ohm, float(resistance_factor(mean_c)), amplitude_std.size)
-        A = select @ total[:-2, :-2] @ select.T
-        XWu = select @ total[:-2, -1]
-        r = XWu - A @ theta0
-        a = moments[:, :-2, -2] @ select.T
-        r_log = moments[:, -2, -1] - a @ theta0
-        square = float(total[-1, -1] - theta0 @ (XWu + r))  # of the errors at θ₀
-        variance = prior.residual_v**2
-        for _ in range(12):  # fewer where it has converged
-            v = variance * SECONDS_PER_DATUM
-            s = 1.0 / (w + v / level_std**2)
-            precision = (A - (a * s[:, None]).T @ a) / v + Lambda
-            delta = np.linalg.solve(precision, (r - a.T @ (s * r_log)) / v)
-            left = r_log - a @ delta
-            level = s * left
-            square_left = square - 2.0 * float(delta @ r) + float(delta @ A @ delta)
-            square_left += float(level @ (w * level - 2.0 * left))
-            residual2 = max(square_left, 0.0) / weight
-            following = residual2 + (ADDED_STD * mean_v) ** 2
-            if abs(following / variance - 1.0) < 1e-3:
-                break
-            variance = following
+        normal = _normal_equations(moments, w, select, theta0)
+        delta, precision, residual_v2 = _with_own_noise(
+            normal, Lambda, level_std, prior.residual_v**2, (ADDED_STD * mean_v) ** 2
+        )
         theta = theta0 + delta
         fitted_ohm = theta[N + 1 : N + 1 + M]
         ohm = fitted_ohm if fitted_ohm.sum() < 0.0 else prior.arrhenius_ohm
     covariance = np.linalg.inv(precision)
     covariance = 0.5 * (covariance + covariance.T)
     covariance[P - 1, P - 1] += B_LEFT_STD**2
-    residual_v = float(np.sqrt(residual2))
+    residual_v = float(np.sqrt(residual_v2))
     return Solution(theta, covariance, arrhenius_ohm, residual_v, mean_v, mean_c, select=select)
+
+
+_Normal = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float]
+"""A, r, and of each log al, rl and wl, in the symbols of `solve`; and (u − X·θ₀)ᵀW(u − X·θ₀)."""
+
+
+def _normal_equations(
+    moments: FloatArray, w: FloatArray, select: FloatArray, theta0: FloatArray
+) -> _Normal:
+    """Return the normal equations about θ₀ from the moments and weights of each log."""
+    total = moments.sum(axis=0)
+    A = select @ total[:-2, :-2] @ select.T
+    XWu = select @ total[:-2, -1]
+    r = XWu - A @ theta0
+    a = moments[:, :-2, -2] @ select.T
+    r_log = moments[:, -2, -1] - a @ theta0
+    return A, r, a, r_log, w, float(total[-1, -1] - theta0 @ (XWu + r))
+
+
+def _with_own_noise(
+    normal: _Normal,
+    Lambda: FloatArray,
+    level_std: FloatArray,
+    variance_v2: float,
+    added_v2: float,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Solve the equations with the noise that their own residuals have: a fixed point.
+
+    Parameters
+    ----------
+    normal : tuple
+    Lambda : array of shape (p, p)
+    level_std : array of shape (logs,)
+        σl [V].
+    variance_v2 : float
+        Variance of a datum to begin with [V²].
+    added_v2 : float
+        What it has beside the residuals [V²].
+
+    Returns
+    -------
+    delta : array of shape (p,)
+    precision : array of shape (p, p)
+    residual_v2 : float
+        Mean square residual [V²].
+    """
+    A, r, a, r_log, w, square_v2 = normal
+    for _ in range(12):  # fewer where it has converged
+        v = variance_v2 * SECONDS_PER_DATUM
+        s = 1.0 / (w + v / level_std**2)
+        precision = (A - (a * s[:, None]).T @ a) / v + Lambda
+        delta = np.asarray(np.linalg.solve(precision, (r - a.T @ (s * r_log)) / v), np.float64)
+        left = r_log - a @ delta
+        level = s * left
+        left_v2 = square_v2 - 2.0 * float(delta @ r) + float(delta @ A @ delta)
+        left_v2 += float(level @ (w * level - 2.0 * left))
+        residual_v2 = max(left_v2, 0.0) / float(w.sum())
+        following_v2 = residual_v2 + added_v2
+        if abs(following_v2 / variance_v2 - 1.0) < 1e-3:
+            break
+        variance_v2 = following_v2
+    return delta, precision, residual_v2
 
 
 def _selection(arrhenius_ohm: FloatArray, warm: float, amplitudes: int) -> FloatArray:
