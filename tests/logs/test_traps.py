@@ -342,18 +342,23 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
     [
         ("1,800", "380.5", (1800.0, 380.5)),  # one mark is decimal in this table
         ("1.800", "380,5", (1800.0, 380.5)),
-        ("1,800", "380", (1.8, 380.0)),  # nothing tells
+        ("1,800", "380", None),  # nothing tells
+        ("1,800", "380.500", (1800.0, 380.5)),  # no battery has 380,500 V …
+        ("1,800", "380,500", (1.8, 380.5)),
         ("1,80", "380.5", (1.8, 380.5)),  # each column its own
-        ("1,800", "380.500", (1.8, 380.5)),
         ("1.800;20,5", "380.5", (1.8, 380.5)),  # both are decimal
     ],
 )
 def test_a_mark_separates_thousands_if_the_other_is_decimal(
-    tmp_path: Path, current: str, voltage: str, ends: tuple[float, float]
+    tmp_path: Path, current: str, voltage: str, ends: tuple[float, float] | None
 ) -> None:
     stamp = "13.03.2024;23:59:{k:02d}"
     current, _, celsius = current.partition(";")
     rows = rows_of(f"{stamp};{current};{voltage};{celsius or 20}", 60)
+    if ends is None:
+        with pytest.raises(InputError, match=r"Strom: it may be 1\.800 or 1800: .*decimal point"):
+            read(tmp_path, "Datum;Zeit;Strom;Spannung;Temperatur", rows)
+        return
     log = read(tmp_path, "Datum;Zeit;Strom;Spannung;Temperatur", rows)
     assert (log.current_a[0], log.voltage_v[0]) == ends
     assert log.time_s[0] == 1_710_374_340.0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -26,7 +27,7 @@ from cangauge.logs.quantities import FIELDS
 from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
-from cangauge.logs.values import is_number, numbers_of
+from cangauge.logs.values import UnclearMarkError, is_number, numbers_of
 from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
@@ -137,13 +138,35 @@ class LogFile:
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
     ) -> Log:
-        """Read the log; arguments and errors as of `cangauge.read_log`."""
+        """Read the log; arguments and errors as of `cangauge.read_log`.
+
+        Of two readings of a mark (`3,800`), the only one that makes a log is taken.
+        """
         require_temperature(temperature_c)
+        try:
+            return self._read(self.head, temperature_c, temperature_source)
+        except UnclearMarkError as error:
+            logs = list[Log]()
+            for mark in (",", "."):
+                head = self.head.with_decimals(mark)
+                with suppress(InputError):
+                    logs.append(self._read(head, temperature_c, temperature_source))
+            if len(logs) != 1:
+                raise
+            remark = f"{error.field}: {error.problem}; only one of them makes a log"
+            return replace(logs[0], remarks=(*logs[0].remarks, remark))
+
+    def _read(
+        self,
+        head: Head,
+        temperature_c: float | None,
+        temperature_source: TemperatureSource | None,
+    ) -> Log:
         reader = self.reader
         if reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
         try:
-            draft = reader.read(self.head, self.columns)
+            draft = reader.read(head, self.columns)
             pa.default_memory_pool().release_unused()  # the table's, before the checks take theirs
             draft.ignored = tuple(name for name in draft.ignored if name not in self.read_besides)
             return draft.log(temperature_c, temperature_source, self.sign)

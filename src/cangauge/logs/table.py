@@ -81,7 +81,7 @@ class ArrowTable:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
-        return read_cells(columns, self.headings)
+        return read_cells(columns, self.headings, self.source)
 
 
 def draft_of_table(

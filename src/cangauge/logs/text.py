@@ -22,7 +22,13 @@ from cangauge.logs.columns import NEEDED, Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps, is_stamp
-from cangauge.logs.values import is_number, numbers_in, read_cells, unit_in_cell
+from cangauge.logs.values import (
+    has_spelled_numbers,
+    is_number,
+    numbers_in,
+    read_cells,
+    unit_in_cell,
+)
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
@@ -80,9 +86,13 @@ class TextTable(NamedTuple):
         types = {names[place]: pa.string() for place in places}
         try:
             beginning = parsed(data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1] or data, types)
+            numbers = numbers_in(beginning)
             try:
-                table = parsed(data, types | numbers_in(beginning))
-            except pa.ArrowInvalid:  # a cell far below is no bare number
+                table = parsed(data, types | numbers)
+                is_refuted = bool(numbers) and has_spelled_numbers(table.columns)
+            except pa.ArrowInvalid:
+                is_refuted = True
+            if is_refuted:  # by a cell far below
                 table = parsed(data, types)
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0]
@@ -96,7 +106,15 @@ class TextTable(NamedTuple):
             self.remarks.append(f"the last line has no line end: {doubt}")
         headings = [*self.headings, *repeat("", width)]
         parts = [[place for place in places if (place in apart) is each] for each in (False, True)]
-        read = (read_cells({p: table.column(names[p]) for p in part}, headings) for part in parts)
+        read = (
+            read_cells(
+                {place: table.column(names[place]) for place in part},
+                headings,
+                str(self.head.path),
+                self.head.decimal_mark,
+            )
+            for part in parts
+        )
         return {place: cells for part in read for place, cells in part.items()}
 
     def _width(self, places: Sequence[int]) -> int:

@@ -20,10 +20,15 @@ _NUMBER: Final = r"^[-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?\s*\D{0,4}$"
 _SPELLINGS: Final = (("[\u2212\u2013]", "-"), ("['\u2019\u00a0\u202f](\\d{3})", r"\1"))
 """A typographic minus; 1'800."""
 _THOUSANDS: Final = r"^[-+]?[1-9]\d{{0,2}}(?:[{}]\d{{3}})+\D{{0,5}}$"
-_DATE: Final = re.compile(r"\d{1,4}\.\d{1,2}\.\d{1,4}")
+_ONE_MARK: Final = r"^[^.,]*[{}][^.,]*$"
+_DATE: Final = r"^\d{1,4}\.\d{1,2}\.\d{1,4}$"
 """`13.03.2024` has no decimal mark."""
 _MARKS: Final = {",": ".", ".": ","}
 """What separates decimals, and what then may separate thousands."""
+
+
+class UnclearMarkError(InputError):
+    """A table of which no number tells whether a mark separates thousands or decimals."""
 
 
 def is_number(text: str) -> bool:
@@ -56,37 +61,51 @@ def first_text(column: Any) -> str:
     return str(known[0]) if known else ""
 
 
-def read_cells(columns: Mapping[int, Any], headings: Sequence[str]) -> dict[int, Any]:
+def read_cells(
+    columns: Mapping[int, Any],
+    headings: Sequence[str],
+    source: str | None,
+    decimal_mark: str = "",
+) -> dict[int, Any]:
     """Return columns of one table: text that holds numbers as these, other text trimmed.
 
-    Null stands where there is no value, and where a restarted logger wrote its header again. If all
-    numbers are written as programs do, that is all. If not, the columns of numbers are read again
-    as they are spelled (`−1'800,5 V`): what a mark means in one column tells it in another.
+    Null stands where there is no value, and where a restarted logger wrote its header again.
+    Numbers are read as they are spelled (`−1'800,5 V`): what a mark means in one cell tells it in
+    all others of the table. `decimal_mark` is that of a table of which no cell does.
+
+    Raises
+    ------
+    UnclearMarkError
+        If nothing tells whether a mark separates thousands or decimals (`3,800`).
     """
     texts = {place: each.cast(pa.string()) for place, each in columns.items() if is_text(each)}
-    read = {**columns}
-    for place, cells in texts.items():
-        read[place] = _as_numbers(cells)
-        if is_text(read[place]):
-            texts[place] = _present(cells, headings[place])
-            read[place] = _as_numbers(texts[place])
-    if any(is_text(read[place]) and _begins_with_number(cells) for place, cells in texts.items()):
-        spelled = {place: cells for place, cells in texts.items() if _begins_with_number(cells)}
-        for place, cells in _with_decimal_points(spelled).items():
-            read[place] = _as_numbers(cells)
-    return read
+    present = {place: _present(cells, headings[place]) for place, cells in texts.items()}
+    read = _with_decimal_points(present, headings, source, decimal_mark)
+    return {**columns, **{place: _as_numbers(cells) for place, cells in read.items()}}
 
 
 def numbers_in(beginning: Any) -> dict[str, Any]:
-    """Return the types of columns of numbers by the beginning of a table, unless one is spelled.
+    """Return the types of columns of numbers by the beginning of a table.
 
-    They are then parsed without the text, which would take twice the memory of a long log.
+    They are then parsed without the text, which would take twice the memory of a long log. A later
+    cell that these types cannot mean fails to parse: a decimal comma, or a point where none shows
+    in the beginning that it is decimal.
     """
     columns = dict(zip(beginning.column_names, beginning.columns, strict=True))
     bare = [name for name, cells in columns.items() if not is_text(_as_numbers(cells))]
-    texts = [_present(cells, name) for name, cells in columns.items() if name not in bare]
-    texts = [cells for cells in texts if is_text(_as_numbers(cells))]
-    return {} if any(map(_begins_with_number, texts)) else dict.fromkeys(bare, pa.float64())
+    if has_spelled_numbers([columns[name] for name in columns.keys() - bare]):
+        return {}
+    if any(_odd(columns[name], _ONE_MARK, ".") for name in bare):
+        return dict.fromkeys(bare, pa.float64())
+    has_points = any(_any(columns[name], "[.]") for name in bare)
+    return {} if has_points else dict.fromkeys(bare, pa.int64())
+
+
+def has_spelled_numbers(columns: Sequence[Any]) -> bool:
+    """Return whether columns hold numbers that are not written as programs do (`3,8`)."""
+    return any(
+        is_text(cells) and _any(_numbers_among(_spelled_alike(cells)), "[,]") for cells in columns
+    )
 
 
 def _as_numbers(cells: Any) -> Any:
@@ -105,33 +124,71 @@ def _present(cells: Any, heading: str) -> Any:
     return pc.if_else(is_missing, pa.scalar(None, pa.string()), trimmed)
 
 
-def _begins_with_number(cells: Any) -> bool:
-    first = first_text(cells)
+def _spelled_alike(cells: Any) -> Any:
+    """Return cells with `-` as minus, and without blanks and apostrophes between thousands."""
     for pattern, alike in _SPELLINGS:
-        first = re.sub(pattern, alike, first)
-    return re.match(_NUMBER, first) is not None and not _DATE.fullmatch(first)
+        cells = pc.replace_substring_regex(cells, pattern, alike)
+    return cells
 
 
-def _with_decimal_points(columns: Mapping[int, Any]) -> dict[int, Any]:
-    """Return columns of numbers with `-` as minus and `.` as the only mark.
+def _numbers_among(cells: Any) -> Any:
+    """Return the cells that are numbers, in any spelling; the others null."""
+    is_number = pc.and_not(
+        pc.match_substring_regex(cells, _NUMBER), pc.match_substring_regex(cells, _DATE)
+    )
+    return pc.if_else(is_number, cells, pa.scalar(None, pa.string()))
 
-    A mark separates thousands in a column where each of its uses fits that (`1,800`), if the other
-    mark is decimal: it follows in the same cell, or the table's numbers use it and not this one.
+
+def _with_decimal_points(
+    texts: Mapping[int, Any], headings: Sequence[str], source: str | None, decimal_mark: str
+) -> dict[int, Any]:
+    """Return columns of text, their numbers with `-` as minus and `.` as the only mark."""
+    alike = {place: _spelled_alike(cells) for place, cells in texts.items()}
+    numbers = {place: _numbers_among(cells) for place, cells in alike.items()}
+    numbers = {place: cells for place, cells in numbers.items() if _any(cells, "[.,]")}
+    own = {place: _decimal_marks(cells) for place, cells in numbers.items()}
+    of_table = set[str]().union(*own.values())
+    of_table = of_table or {*decimal_mark}
+    for place, cells in numbers.items():
+        decimal = own[place] if len(own[place]) == 1 else of_table
+        if not decimal:
+            _refuse_unclear(cells, source, headings[place])
+        thousands = _MARKS[min(decimal)] if len(decimal) == 1 else "'"
+        bare = pc.replace_substring(pc.replace_substring(cells, thousands, ""), ",", ".")
+        alike[place] = pc.coalesce(bare, alike[place])
+    return alike
+
+
+def _decimal_marks(numbers: Any) -> set[str]:
+    """Return the marks that a column shows to be decimal.
+
+    A mark is decimal where it cannot separate thousands, where it follows the other mark, and where
+    the other mark stands twice.
     """
-    texts = {**columns}
-    for pattern, alike in _SPELLINGS:
-        for place, cells in texts.items():
-            texts[place] = pc.replace_substring_regex(cells, pattern, alike)
-    one_mark = r"^[^.,]*[{}][^.,]*$"
-    used = {mark for mark in _MARKS for cells in texts.values() if _odd(cells, one_mark, mark)}
-    for place, cells in texts.items():
-        for mark, other in _MARKS.items():
-            follows = _any(cells, rf"[{other}][^{other}]*[{mark}][^{mark}{other}]*$")
-            if follows or (used == {mark} and not _odd(cells, "[{}]", other)):
-                texts[place] = pc.replace_substring(cells, other, "")
-                break
-        texts[place] = pc.replace_substring(texts[place], ",", ".")
-    return texts
+    return {
+        mark
+        for mark, other in _MARKS.items()
+        if _odd(numbers, _ONE_MARK, mark)
+        or _any(numbers, rf"[{other}][^{other}]*[{mark}][^{mark}{other}]*$")
+        or _any(numbers, rf"[{other}]\d{{3}}[{other}]")
+    }
+
+
+def _refuse_unclear(numbers: Any, source: str | None, label: str) -> None:
+    """Raise UnclearMarkError if a mark may separate thousands as well as decimals.
+
+    A point is decimal, as programs write it, but not beside a number without one where it ends in
+    0: decimals are written in all cells, or without the last zeros.
+    """
+    has_points = _any(numbers, "[.].*0$") and _any(numbers, r"^[-+]?[1-9]\d*$")
+    marked = pc.match_substring_regex(numbers, "[.,]" if has_points else "[,]")
+    unclear = numbers.filter(pc.fill_null(marked, fill_value=False))
+    if len(unclear):
+        text = unclear[0].as_py()
+        plain = re.sub("[.,]", "", text)
+        problem = f"it may be {text.replace(',', '.')} or {plain}: all marks have three digits"
+        cure = "export the numbers without marks of thousands, with a decimal point"
+        raise UnclearMarkError(problem, source=source, field=label, value=text, cure=cure)
 
 
 def _any(cells: Any, pattern: str) -> bool:

@@ -261,7 +261,6 @@ def _time_of(text: TextTable) -> str:
 def _numbers(cells: Any) -> FloatArray:
     """Return the numbers in cells, NaN where a word ("unavailable") ends a value."""
     if is_text(cells):
-        cells = pc.replace_substring(cells, ",", ".")
         is_number = pc.match_substring_regex(cells, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
         cells = pc.if_else(is_number, cells, pa.scalar(None, pa.string()))
     return np.asarray(pc.cast(cells, pa.float64()).to_numpy())
