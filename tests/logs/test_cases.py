@@ -64,7 +64,7 @@ OF_HEADINGS = set(CASES) - {
     name for name in CASES
     if name.startswith(("canonical", "quotes", "d3", "battery-data", "bmw", "esc", "bitrode",
                         "visualcn"))
-    or name in {"arbin", "arbin-with-thermocouple"}
+    or (name.startswith("arbin") and name != "arbin-link")
 }  # fmt: skip
 """Files whose format does not define the columns: what was assumed is stated."""
 

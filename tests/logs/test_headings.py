@@ -6,7 +6,7 @@ import pytest
 
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
-from cangauge.logs.headings import meaning_of
+from cangauge.logs.headings import charge_scale, meaning_of, parse_heading
 
 SPELLINGS = {
     "Arbin": (
@@ -144,6 +144,32 @@ def test_current_may_be_an_adjective_and_time_the_instant_of_anything(
 ) -> None:
     meaning = meaning_of(heading)
     assert (meaning and meaning.quantity) == quantity
+
+
+@pytest.mark.parametrize(
+    ("heading", "parts"),
+    [
+        ("max. SoC [%)", ("max. SoC", "%", "")),
+        ("HVBatt_SOC_CAN5__per", ("HVBatt_SOC_CAN5_", "per", "")),
+        ("Aux_Temperature_1 (F)", ("Aux_Temperature_1", "F", "")),
+        (
+            "HV Battery Current w/200A max clamp [A]",
+            ("HV Battery Current w/200A max clamp", "A", ""),
+        ),
+        ("Dis-Charging I/mA", ("Dis-Charging I", "mA", "Dis-Charging")),
+        ("step_index", ("step_index", "", "")),
+    ],
+)
+def test_parts_of_a_heading(heading: str, parts: tuple[str, str, str]) -> None:
+    assert parse_heading(heading) == parts
+
+
+@pytest.mark.parametrize(
+    ("heading", "scale"),
+    [("dq/mA.h", 1e-3), ("Consumed Ah", 1.0), ("AmpHours", 1.0), ("Q (mAh)", 1e-3), ("Hr", None)],
+)
+def test_units_of_charge(heading: str, scale: float | None) -> None:
+    assert charge_scale(heading) == scale
 
 
 def test_unit_of_another_quantity_refutes_a_heading() -> None:

@@ -10,7 +10,7 @@ from typing import Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.column_map import DOCS, SYNTAX, ColumnMap, meant_by
-from cangauge.logs.headings import Meaning, Rank, meaning_of, names_and_units
+from cangauge.logs.headings import Meaning, Rank, meaning_of, parse_heading
 from cangauge.logs.quantities import FIELDS, QUANTITIES, REQUIRED, unit_of
 from cangauge.settings import TemperatureSource
 
@@ -19,7 +19,6 @@ NEEDED: Final = ("time", "current", "voltage")
 _CANONICAL: Final = (*FIELDS.values(), "temperature_source")
 _JOINED: Final = ("time", "temperature")
 """Quantities of several columns: a date and its time; probes, whose median is taken."""
-_DIRECTION: Final = re.compile(r"(?P<dis>dis?|de)?[-_ ]?(?:charg(?:ed|e|ing)|chg)", re.IGNORECASE)
 
 _Found = tuple[int, Meaning]
 """Place and meaning of a column."""
@@ -123,7 +122,7 @@ def _text_of(headings: Sequence[str], place: int, meaning: Meaning | None = None
     """Return a column as a user would name it: by number where its heading stands twice."""
     text = headings[place] if headings.count(headings[place]) == 1 else f"#{place + 1}"
     unit = "" if meaning is None else meaning.unit
-    return text if unit in {"", names_and_units(headings[place])[0][1]} else f"{text}[{unit}]"
+    return text if unit in {"", parse_heading(headings[place]).unit} else f"{text}[{unit}]"
 
 
 def _that_read(
@@ -267,13 +266,12 @@ def _directions(headings: Sequence[str], found: Sequence[_Found]) -> ChosenColum
     """Return the currents of discharge and charge, in this order, if they alone are plain."""
     pairs: dict[tuple[str, str], dict[bool, int]] = {}
     for place, meaning in found:
-        match = _DIRECTION.search(headings[place])
-        rest = "" if match is None else _simple(headings[place].replace(match[0], ""))
-        without = meaning if match is None else meaning_of(rest)
+        heading = parse_heading(headings[place])
+        rest = _simple(heading.name.replace(heading.way, "")) if heading.way else ""
+        without = meaning_of(rest, heading.unit) if heading.way else meaning
         if without is None or without.quantity != "current" or without.rank >= Rank.GUESS:
             continue
-        is_discharge = bool(match and match["dis"])
-        pairs.setdefault((rest, meaning.unit), {})[is_discharge] = place
+        pairs.setdefault((rest, meaning.unit), {})[heading.is_discharge] = place
     if len(pairs) != 1:
         return None
     ((_, unit), places), *_ = pairs.items()
@@ -314,8 +312,8 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
     """Return the unit of this quantity that a heading states, whatever its words; "" if none."""
     if meaning is not None and meaning.quantity == quantity:
         return meaning.unit
-    units = (unit for _, unit in names_and_units(heading)[:-1])
-    return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
+    unit = parse_heading(heading).unit
+    return "" if unit_of(FIELDS[quantity], unit) is None else unit
 
 
 def _places(text: str, headings: Sequence[str], *, is_joined: bool) -> tuple[int, ...]:
@@ -338,7 +336,7 @@ def _place(text: str, headings: Sequence[str]) -> int | None:
     number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
-    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
+    bare = [_simple(parse_heading(heading).name) for heading in headings]
     return bare.index(name) if bare.count(name) == 1 else None
 
 

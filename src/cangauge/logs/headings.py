@@ -33,6 +33,7 @@ _UNIT_FORMS: Final = (
 """`Name [unit]`, `Name/unit`, `Name_unit`."""
 _TIMES: Final = re.compile(r"[\s_*(]*x\s?(10+)\b\)?")
 """`Voltage x100`: the cells are a hundred times the voltage."""
+_WAY: Final = re.compile(r"(?:dis?|de)?[-_ ]?(?:charg(?:ed|e|ing)|chg)", re.IGNORECASE)
 _CELL_VOLTAGE: Final = re.compile(
     r"(?:cell|zelle)[\s_#-]*(?:voltage|volt|v|u)?[\s_#-]*0*(?P<number>\d{1,4})"
     r"[\s_]*(?:voltage|volts?)?[\s_]*[\[(]?(?P<unit>m?v)?[\])]?",
@@ -53,6 +54,22 @@ _NO_UNITS: Final = frozenset({"1", "-", "d"})
 """Units that end a heading as other than a unit: `Sensor 1`."""
 _CLOCK: Final = re.compile(r"h+\s*:\s*m", re.IGNORECASE)
 """What a heading of clock times has in place of a unit."""
+
+
+class Heading(NamedTuple):
+    """Parts of a heading: its name, the unit behind it, and the word for the way of a current.
+
+    `way` is the part of the name that says that a current charges or discharges.
+    """
+
+    name: str
+    unit: str
+    way: str
+
+    @property
+    def is_discharge(self) -> bool:
+        """Whether the word for the way is one of discharge."""
+        return self.way[:1].lower() == "d"
 
 
 class Rank(IntEnum):
@@ -98,7 +115,7 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
             return None
         unit = found.unit or QUANTITIES[found.quantity].unit
         return found._replace(unit=f"{1.0 / float(times[1]):g}{unit}")
-    meanings = (_meaning(name, unit) for name, unit in names_and_units(heading, unit_below))
+    meanings = (_meaning(name, unit) for name, unit in _readings(heading, unit_below))
     return next((meaning for meaning in meanings if meaning is not None), None)
 
 
@@ -113,15 +130,29 @@ def cell_number(heading: str) -> tuple[int, float] | None:
 
 def charge_scale(heading: str, unit_below: str = "") -> float | None:
     """Return the factor to Ah of a column that counts charge, or None (`Consumed Ah`, `[mAh]`)."""
-    units = [unit.lower() for _, unit in names_and_units(heading, unit_below)]
-    words = _words_of(heading) if len(heading) <= LONGEST else []
-    if "mah" in units or "mah" in words:
+    name, unit, _ = parse_heading(heading, unit_below)
+    words = [unit.lower().replace(".", ""), *_words_of(name)]
+    if "mah" in words:
         return 1e-3
-    is_count = "ah" in units or not WORDS["charge"].isdisjoint(words)
-    return 1.0 if is_count or ("amp" in words and "hours" in words) else None
+    is_count = not WORDS["charge"].isdisjoint(words) or {"amp", "hours"}.issubset(words)
+    return 1.0 if is_count else None
 
 
-def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]:
+def parse_heading(heading: str, unit_below: str = "") -> Heading:
+    """Return the parts of a heading, or of one with the cell of a row of units.
+
+    Examples
+    --------
+    >>> parse_heading("HVBatt_charge_current__mA")
+    Heading(name='HVBatt_charge_current_', unit='mA', way='charge')
+    """
+    readings = _readings(heading, unit_below)
+    name, unit = next((each for each in readings if _is_unit(each[1])), readings[-1])
+    match = _WAY.search(name[:LONGEST])
+    return Heading(name, unit, match[0] if match else "")
+
+
+def _readings(heading: str, unit_below: str = "") -> list[tuple[str, str]]:
     """Return (name, unit) as a heading may be meant, the most explicit first, the whole last."""
     heading = heading.strip()
     if heading.lower() in WORDS["degrees"] or heading.lower() == "millis":
@@ -141,7 +172,7 @@ def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]
 
 
 def _is_unit(text: str) -> bool:
-    if text.lower() in WORDS["foreign_units"]:
+    if text.lower().replace(".", "") in WORDS["foreign_units"]:
         return True
     return text not in _NO_UNITS and any(each.scale_of(text) for each in QUANTITIES.values())
 

@@ -17,14 +17,11 @@ from cangauge._typing import FloatArray
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import shown_headings
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.headings import LONGEST
+from cangauge.logs.headings import parse_heading
 from cangauge.logs.quantities import REQUIRED, convert
 from cangauge.logs.text import TextTable, split_cells
 from cangauge.logs.values import numbers_of
 from cangauge.settings import TemperatureSource
-
-# One heading of the i3 trips misspells the unit's bracket: `max. SoC [%)`; D3's units follow `__`.
-_UNIT: Final = re.compile(r"\s*(?:\[([^\])]*)[\])]|__([^_\s]*))?\s*$")
 
 
 class _Column(NamedTuple):
@@ -37,12 +34,12 @@ class _Column(NamedTuple):
 
 
 def _columns(cells: Sequence[str]) -> list[_Column]:
-    found = []
-    for place, text in enumerate(cells):
-        match = _UNIT.search(text[:LONGEST])
-        name, unit = (text[: match.start()], match[1] or match[2] or "") if match else (text, "")
-        found.append(_Column(place, text, re.sub(r"[\s_]", "", name).lower(), unit))
-    return found
+    parts = [(text, *parse_heading(text)) for text in cells]
+    return [_Column(k, text, _simple(name), unit) for k, (text, name, unit, _) in enumerate(parts)]
+
+
+def _simple(name: str) -> str:
+    return re.sub(r"[\s_]", "", name).lower()
 
 
 def _matching(columns: Sequence[_Column], *patterns: str) -> list[_Column]:
@@ -248,7 +245,7 @@ _INSTRUMENTS: Final = {
 def _cycler(name: str, time: str, current: str, voltage: str, *more: str, **how: Any) -> Export:
     """Return a cycler's export by its headings, in lower case."""
     headings = time, current, voltage
-    simple = [re.escape(re.sub(r"[\s_]", "", heading)) for heading in headings]
+    simple = [re.escape(_simple(parse_heading(heading).name)) for heading in headings]
     known_by = tuple(map(re.escape, (*headings, *more)))
     return Export(name, known_by, {"time_s": (simple[0],)}, {"": (simple[1], simple[2])}, **how)
 
@@ -321,7 +318,7 @@ READERS: Final = (
         "current / a",
         "voltage / v",
         sensors="surfacetemperaturet.*",
-        ambient="ambienttemperature/degc",
+        ambient="ambienttemperature",
     ),
     _cycler(
         _BDF,
@@ -329,7 +326,7 @@ READERS: Final = (
         "current_ampere",
         "voltage_volt",
         sensors="temperaturet.*",
-        ambient="ambienttemperaturecelsius",
+        ambient="ambienttemperature",
     ),
     _cycler(
         "battery-data-standard",
@@ -337,6 +334,6 @@ READERS: Final = (
         "current_a",
         "voltage_v",
         sensors="temperaturet.*",
-        ambient="ambienttemperaturedegc",
+        ambient="ambienttemperature(deg)?",
     ),
 )
