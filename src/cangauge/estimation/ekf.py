@@ -326,13 +326,11 @@ class SocFilter:
         self.bias.update(H, K, self.y, self.S, drop_v)
 
 
-def inverse_std_pct(
-    model: OnlineModel, soc_pct: float, temperature_c: float, load: FloatArray
-) -> float:
-    """Return the standard deviation of the SoC by inverse of one row's voltage [%]."""
+def inverse_std_pct(model: OnlineModel, soc_pct: float, temperature_c: float) -> float:
+    """Return the standard deviation of the SoC by inverse of the latest row's voltage [%]."""
     noise, A = model.noise, model.noise.cold(temperature_c)
     slope = max(model.pseudo_ocv_at(soc_pct)[1], LEAST_SLOPE)
-    row = model.functions.row(soc_pct, load)
+    row = model.functions.row(soc_pct, model.load)
     variance = row @ row + A**2 * (
         noise.level_std_v**2 + noise.slow_std_v**2 + noise.residual_std_v**2
     )

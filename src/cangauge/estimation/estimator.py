@@ -17,7 +17,6 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.estimation import checks
@@ -199,17 +198,15 @@ class Estimator:
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
         self._refresh()
-        counter, latest = self._counter, self.estimate
-        is_counting = not math.isnan(counter.time_s)
-        _, load_v, drop_v = self._load() if is_counting else (None, math.nan, math.nan)
+        latest = self.estimate
         return PackTick(
             time_s=sample.time_s,
             soc_pct=latest.soc_pct,
             soc_std_pct=latest.soc_std_pct,
             voltage_v=sample.voltage_v,
-            without_ocv_v=load_v,
-            drop_v=drop_v,
-            moved_pct=counter.moved_pct,
+            without_ocv_v=self.online.load_v,
+            drop_v=self.online.drop_v,
+            moved_pct=self._counter.moved_pct,
         )
 
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
@@ -267,17 +264,17 @@ class Estimator:
     def _use_row(self, sample: Sample) -> None:
         """Compare a row's voltage with the model, add it to the open block, look for references."""
         memory, online, counter = self._memory, self.online, self._counter
-        load, load_v, drop_v = self._load()
-        self._invert(sample.voltage_v - load_v, load)
+        load_v = online.load_v
+        self._invert(sample.voltage_v - load_v)
         if not math.isnan(sample.voltage_v):
             row = Block(
                 counter.counted_s,
                 counter.discharged_pct,
                 sample.voltage_v,
                 memory.temperature_c,
-                drop_v,
+                online.drop_v,
                 online.unseen_v_per_a**2 * counter.turned_a2,
-                load,
+                online.load,
                 online.drives,
             )
             self._block.add(row)
@@ -288,7 +285,7 @@ class Estimator:
         for reference in checks.detect_references(self.settings, memory, sample):
             self._correct(*reference)
 
-    def _invert(self, ocv_v: float, load: FloatArray) -> None:
+    def _invert(self, ocv_v: float) -> None:
         """Find the SoC of a row's voltage without load [V]; NaN: it has none."""
         memory, at = self._memory, self.online.pseudo_ocv_at
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
@@ -299,7 +296,7 @@ class Estimator:
         memory.newton_pct, memory.newton_inside = soc_from_ocv(at, ocv_v, guess_pct)
         if self.settings.method == "newton":  # no other method asks for it
             memory.newton_std_pct = inverse_std_pct(
-                self.online, memory.newton_pct, self._temperature_c, load
+                self.online, memory.newton_pct, self._temperature_c
             )
 
     def _confirm_current(self, row: Block, sample: Sample) -> None:
@@ -335,27 +332,25 @@ class Estimator:
         elif hypotheses.is_rejected and not was_rejected:
             memory.contradicted_until_s = time_s + CONTRADICTED_S
         memory.is_known = True
-        if self._is_mismatched(time_s):
-            # The model may be right and the SoC wrong: charge that was not seen.
-            memory.innovations = []
-            self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
+        self._test_model(time_s)
         if math.isnan(memory.coulomb_start_pct):
             self._start_count(*self._filter_soc())
 
-    def _is_mismatched(self, time_s: float) -> bool:
-        """Flag a mismatch, and return whether the innovations of the last ten minutes show it.
+    def _test_model(self, time_s: float) -> None:
+        """Flag a mismatch of model and pack, and doubt the SoC if ten minutes of voltages show it.
 
         Under the model the normalised innovations are independent standard normal, and what is
         learned of the constants lies together within their priors.
         """
-        memory, likelier = self._memory, self.hypotheses.likelier
-        limits = self.limits
+        memory, limits, likelier = self._memory, self.limits, self.hypotheses.likelier
         innovations = [*memory.innovations, likelier.normalised_innovation_squared]
         memory.innovations = innovations[-limits.tested_blocks :]
         is_lasting = sum(memory.innovations) > limits.innovations_at_most
         if is_lasting or likelier.strain() > limits.strain_at_most:
             memory.mismatch_until_s = time_s + checks.MISMATCH_S
-        return is_lasting
+        if is_lasting:  # the model may be right and the SoC wrong: charge that was not seen
+            memory.innovations = []
+            self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
 
     def _predict(self, to: CoulombCounter) -> None:
         """Predict the filter to a count."""
@@ -399,11 +394,6 @@ class Estimator:
         known_c = self._memory.temperature_c
         return self.voltage_model.usual_c if math.isnan(known_c) else known_c
 
-    def _load(self) -> tuple[FloatArray, float, float]:
-        """Return the load row, its voltage, and the part of it by the resistances [V]."""
-        load, theta = self.online.load, self.online.load_coefficients
-        return load, float(load @ theta), float(load[1:] @ theta[1:])
-
     def _soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation [%] of the chosen method; NaN until known."""
         memory, method = self._memory, self.settings.method
@@ -431,8 +421,27 @@ class Estimator:
 
     def _evaluate(self, sample: Sample, implausible: Reason) -> Estimate:
         """Return the estimate after a corrected sample."""
-        memory, line, time_s = self._memory, self.online.delay_line, sample.time_s
+        memory = self._memory
         soc_pct, std_pct = self._soc()
+        reasons = self._reasons(sample, implausible, soc_pct, std_pct)
+        return Estimate(
+            sample.time_s,
+            soc_pct,
+            std_pct,
+            memory.newton_pct,
+            self._coulomb_soc()[0],
+            memory.voltage_model_v,
+            memory.residual_v,
+            status_of(reasons),
+            reasons,
+            memory.samples,
+        )
+
+    def _reasons(
+        self, sample: Sample, implausible: Reason, soc_pct: float, std_pct: float
+    ) -> Reason:
+        """Return what is to be known of an estimate [%] after a corrected sample."""
+        memory, line, time_s = self._memory, self.online.delay_line, sample.time_s
         known = self.voltage_model.range
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
         bits = int(self.always) | int(implausible)
@@ -456,19 +465,7 @@ class Estimator:
         ):
             if is_set:
                 bits |= int(reason)
-        reasons = REASONS[bits]
-        return Estimate(
-            time_s,
-            soc_pct,
-            std_pct,
-            memory.newton_pct,
-            self._coulomb_soc()[0],
-            memory.voltage_model_v,
-            memory.residual_v,
-            status_of(reasons),
-            reasons,
-            memory.samples,
-        )
+        return REASONS[bits]
 
     # --- restart, and another model
 

@@ -243,8 +243,8 @@ class OnlineModel:
         currents = len(self.model.loads.delays_s) + len(self.model.loads.low_pass_s)
         self.unseen_v_per_a = float(np.sum(self.load_coefficients[2 : 1 + currents]))
         """Voltage by earlier currents, which a slow log shows in part [V/A]."""
-        self.load = np.empty(0)
-        """The load columns at the latest reading, shape (k,)."""
+        self.load = np.full(self.load_coefficients.size, math.nan)
+        """The load row at the latest reading, shape (k,); NaN before any."""
         self._over_soc = [each for each in extended.effects if each[0].uses_soc]
         self.drives = np.zeros(1 + len(self._over_soc))
         """The effects' drives at the latest reading, shape (1 + effects over SoC,).
@@ -253,6 +253,16 @@ class OnlineModel:
         is linear in the drives, so that a mean of readings has the mean of their drives.
         """
         self._slope_at_least = SLOPE_AT_LEAST * self.model.nominal_v
+
+    @property
+    def load_v(self) -> float:
+        """Voltage of the load row [V]."""
+        return float(self.load @ self.load_coefficients)
+
+    @property
+    def drop_v(self) -> float:
+        """Part of it over the resistances [V]; negative while discharging."""
+        return float(self.load[1:] @ self.load_coefficients[1:])
 
     def initial_soc_pct(self, assumed_pct: float) -> float:
         """Return the SoC at which to start for an assumed one, within 0–100 [%]."""
@@ -291,8 +301,7 @@ class OnlineModel:
         self.drives = np.zeros_like(self.drives)
         if not self.extended.effects:
             return
-        drop_v = self.load[1:] @ self.load_coefficients[1:]
-        inputs = Inputs(at, now, np.array([known_c]), np.array([drop_v]))
+        inputs = Inputs(at, now, np.array([known_c]), np.array([self.drop_v]))
         over = 0
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
             drive = effect.drive(inputs, values, context)
