@@ -10,9 +10,10 @@ import numpy as np
 
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
+from cangauge.model.curve import Curve
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
-from cangauge.model.voltage_model import DELAYS_S, Curve, Loads, Ranges, VoltageModel
+from cangauge.model.voltage_model import DELAYS_S, Loads, Ranges, VoltageModel
 
 
 def drive_current(time_s: np.ndarray, mean_a: float, seed: int) -> np.ndarray:

@@ -32,9 +32,10 @@ from cangauge.model.coulomb_counting import (
     capacity_from_reference,
     discharged_ah,
 )
+from cangauge.model.curve import KNOTS_PCT, HermiteCurve
 from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
-from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve, VoltageModel
+from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import Reason
 from synthetic import synthetic_log, voltage_model
 

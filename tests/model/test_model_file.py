@@ -14,8 +14,8 @@ from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
+from cangauge.model.curve import KNOTS_PCT, hermite_basis
 from cangauge.model.model_file import Model
-from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis
 from synthetic import synthetic_log
 
 

@@ -10,16 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
+from cangauge.model.curve import KNOTS_PCT, HermiteCurve, PublishedCurve, hermite_basis
 from cangauge.model.delay_line import DelayLine, delayed_currents, filled_at
 from cangauge.model.inverse import soc_from_ocv, socs_from_ocv
 from cangauge.model.published import leaf_2012_model
-from cangauge.model.voltage_model import (
-    KNOTS_PCT,
-    Arrhenius,
-    HermiteCurve,
-    PublishedCurve,
-    hermite_basis,
-)
+from cangauge.model.voltage_model import Arrhenius
 from synthetic import voltage_model
 
 MODEL = leaf_2012_model()

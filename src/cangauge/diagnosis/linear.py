@@ -12,10 +12,11 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.rows import Simulated
+from cangauge.model.curve import KNOTS_PCT, HermiteCurve, hermite_basis
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 from cangauge.model.prior import CHEMISTRIES, LOW_PASS_S, PackPrior
-from cangauge.model.voltage_model import KNOTS_PCT, Arrhenius, HermiteCurve, hermite_basis
+from cangauge.model.voltage_model import Arrhenius
 
 N: Final = KNOTS_PCT.size
 """Coefficients of the curve."""

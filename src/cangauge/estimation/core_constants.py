@@ -10,9 +10,9 @@ import math
 from typing import Any, Final, get_args
 
 from cangauge.estimation.estimator import Estimator
+from cangauge.model.curve import HermiteCurve, PublishedCurve
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.extended import OnlineModel
-from cangauge.model.voltage_model import HermiteCurve, PublishedCurve
 from cangauge.settings import Method
 
 KINDS: Final = (

@@ -21,8 +21,8 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.ekf import FUNCTIONS, LEAST_SLOPE, LEVEL, SLOW, SocFilter
 from cangauge.estimation.health import health_of
+from cangauge.model.curve import HermiteCurve
 from cangauge.model.extended import OnlineModel
-from cangauge.model.voltage_model import HermiteCurve
 from cangauge.settings import PackLimits
 from cangauge.types import Health, Power
 

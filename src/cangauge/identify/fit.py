@@ -40,13 +40,14 @@ from cangauge.logs.charge import refuse_contradictions
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.curve import KNOTS_PCT
 from cangauge.model.effects.base import Effect, Values
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Information, Made, Model, SourceLog
 from cangauge.model.noise import Noise
 from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior, principal_functions
-from cangauge.model.voltage_model import DELAYS_S, KNOTS_PCT, Ranges
+from cangauge.model.voltage_model import DELAYS_S, Ranges
 
 Equation = Literal["knots", "published"]
 

@@ -20,13 +20,9 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.rows import FitRows
+from cangauge.model.curve import KNOTS_PCT, hermite_basis
 from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, Distribution, PackPrior
-from cangauge.model.voltage_model import (
-    KNOTS_PCT,
-    REFERENCE_C,
-    hermite_basis,
-    resistance_factor,
-)
+from cangauge.model.voltage_model import REFERENCE_C, resistance_factor
 
 N: Final = KNOTS_PCT.size
 """Knots of the curve."""

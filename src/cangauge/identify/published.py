@@ -17,16 +17,9 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import SECONDS_PER_DATUM
 from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
+from cangauge.model.curve import BASIS_NAMES, EDGE, KNOTS_PCT, PublishedCurve, ocv_basis
 from cangauge.model.model_file import Published
-from cangauge.model.voltage_model import (
-    BASIS_NAMES,
-    DELAYS_S,
-    EDGE,
-    KNOTS_PCT,
-    REFERENCE_C,
-    PublishedCurve,
-    ocv_basis,
-)
+from cangauge.model.voltage_model import DELAYS_S, REFERENCE_C
 
 SINGULAR = 1e-9
 """Singular value relative to the largest, of columns of equal norm, below which a combination of

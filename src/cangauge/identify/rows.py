@@ -25,9 +25,10 @@ from cangauge.errors import InputError
 from cangauge.logs.gaps import usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
+from cangauge.model.curve import BASIS_NAMES
 from cangauge.model.delay_line import delayed_currents, filled_at
 from cangauge.model.prior import LOW_PASS_S
-from cangauge.model.voltage_model import BASIS_NAMES, DELAYS_S, past_currents
+from cangauge.model.voltage_model import DELAYS_S, past_currents
 from cangauge.settings import GAP_S
 
 LOW_VOLTAGE = 0.5

@@ -32,10 +32,10 @@ from cangauge.identify.rows import FitRows, fit_rows
 from cangauge.logs.gaps import discharged_ah, split_where_moved
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import soc_at_first_row
+from cangauge.model.curve import KNOTS_PCT, SLOPE_AT_LEAST, HermiteCurve
 from cangauge.model.effects.base import Signals
 from cangauge.model.model_file import Model
 from cangauge.model.prior import CHEMISTRIES, PackPrior
-from cangauge.model.voltage_model import KNOTS_PCT, SLOPE_AT_LEAST, HermiteCurve
 
 _LOG = logging.getLogger(__name__)
 

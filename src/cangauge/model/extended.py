@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import BRIDGE_S, discharged_ah
+from cangauge.model.curve import SLOPE_AT_LEAST
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import (
     Counting,
@@ -31,7 +32,7 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
 from cangauge.model.inverse import socs_from_ocv
 from cangauge.model.noise import Noise
-from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
+from cangauge.model.voltage_model import Functions, VoltageModel
 from cangauge.settings import GAP_S
 from cangauge.types import Sample
 

@@ -21,6 +21,7 @@ from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._text import number, significant, span
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, as_log
+from cangauge.model.curve import BASIS_NAMES, KNOTS_PCT, HermiteCurve, PublishedCurve
 from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
@@ -43,15 +44,11 @@ from cangauge.model.prior import (
     principal_functions,
 )
 from cangauge.model.voltage_model import (
-    BASIS_NAMES,
     DELAYS_S,
-    KNOTS_PCT,
     REFERENCE_C,
     Arrhenius,
     Functions,
-    HermiteCurve,
     Loads,
-    PublishedCurve,
     Ranges,
     VoltageModel,
 )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from cangauge.errors import InputError
+from cangauge.model.curve import HermiteCurve
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST
 from cangauge.model.noise import Noise
-from cangauge.model.voltage_model import HermiteCurve, VoltageModel
+from cangauge.model.voltage_model import VoltageModel
 
 
 def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:

@@ -26,16 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cangauge._typing import FloatArray
-from cangauge.model.voltage_model import (
-    DELAYS_S,
-    KNOTS_PCT,
-    REFERENCE_C,
-    Functions,
-    Loads,
-    PublishedCurve,
-    hermite_basis,
-    resistance_factor,
-)
+from cangauge.model.curve import KNOTS_PCT, PublishedCurve, hermite_basis
+from cangauge.model.voltage_model import DELAYS_S, REFERENCE_C, Functions, Loads, resistance_factor
 
 ChemistryName = Literal["oxide", "lfp"]
 

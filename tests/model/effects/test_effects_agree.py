@@ -20,11 +20,11 @@ from stepping import (
     within,
 )
 
+from cangauge.model.curve import PublishedCurve
 from cangauge.model.effects.base import Effect, Pack, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
-from cangauge.model.voltage_model import PublishedCurve
 from cangauge.types import Sample
 from selection import nightly_except
 from synthetic import synthetic_log, voltage_model, within_c

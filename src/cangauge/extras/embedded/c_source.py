@@ -16,9 +16,10 @@ from cangauge.estimation.core_constants import (
     settings_constants,
 )
 from cangauge.estimation.estimator import Estimator
+from cangauge.model.curve import HermiteCurve, PublishedCurve
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
-from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, VoltageModel
+from cangauge.model.voltage_model import VoltageModel
 
 CORE_SOURCES: Final = ("cangauge.c", "cangauge_filter.c", "cangauge_model.c")
 CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")

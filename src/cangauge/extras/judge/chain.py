@@ -22,12 +22,13 @@ from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.extras.judge.gauge import is_limit, read_published, resolution_pct
 from cangauge.logs.log import Log
+from cangauge.model.curve import KNOTS_PCT, hermite_basis
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, candidates
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 from cangauge.model.prior import CHEMISTRIES
-from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis, resistance_factor
+from cangauge.model.voltage_model import resistance_factor
 
 BLOCKS_AT_MOST: Final = 240
 """Most blocks used of a stretch. The voltage error is correlated over 300 s, so denser blocks would

@@ -24,7 +24,7 @@ from cangauge.extras.judge.faults import FAULTS
 from cangauge.extras.judge.result import FoundFault
 from cangauge.logs.log import Log
 from cangauge.logs.read import CellColumns
-from cangauge.model.voltage_model import hermite_basis
+from cangauge.model.curve import hermite_basis
 
 LEAST_STD_PCT: Final = 1.0
 """Least spread of the capacities of healthy cells [%]: sorted cells of one batch."""
