@@ -90,7 +90,7 @@ def pack_voltage(model: Model, initial_soc_pct: float) -> list[float]:
         last = now.current_a
         online.advance(time_s, now.current_a, now.temperature_c)
         soc = initial_soc_pct - 100.0 * out_ah / model.capacity_ah
-        volts.append(online.pseudo_ocv_at(soc)[0] + online.load @ online.load_coefficients)
+        volts.append(online.pseudo_ocv_at(soc)[0] + online.load_v)
     return volts
 
 

@@ -50,20 +50,28 @@ def hermite_slopes(soc_pct: FloatArray, values: FloatArray) -> FloatArray:
 
 
 class _Cubic(NamedTuple):
-    """Hermite's cubic between two knots: weights of value and slope at the left, then the right.
+    """Hermite's cubic between two knots, at one SoC or at many.
 
-    Of one SoC or of many: members are numbers, or arrays of shape (n,).
+    It is h00·value + h10·slope of the left knot, plus h01·value + h11·slope of the right one. The
+    members are numbers, or arrays of shape (n,).
     """
 
     left: Any
     """Index of the left knot."""
-    value: tuple[Any, Any, Any, Any]
-    """h00, h10, h01, h11: give the curve."""
-    slope: tuple[Any, Any, Any, Any]
-    """Their derivatives: give its slope."""
+    h: tuple[Any, Any, Any, Any]
+    """h00, h10, h01, h11."""
+    derivative: tuple[Any, Any, Any, Any]
+    """Of these by the SoC [1/%]."""
 
-    def sum(self, weights: tuple[Any, Any, Any, Any], value: Any, slope: Any) -> Any:
-        """Return the weighted sum of values and slopes at the knots."""
+    def values(self, value: Any, slope: Any) -> Any:
+        """Return the curve, given values and slopes at the knots."""
+        return self._sum(self.h, value, slope)
+
+    def slopes(self, value: Any, slope: Any) -> Any:
+        """Return the slope of the curve, given values and slopes at the knots."""
+        return self._sum(self.derivative, value, slope)
+
+    def _sum(self, weights: tuple[Any, Any, Any, Any], value: Any, slope: Any) -> Any:
         h00, h10, h01, h11 = weights
         at_left = h00 * value[self.left] + h10 * slope[self.left]
         return at_left + h01 * value[self.left + 1] + h11 * slope[self.left + 1]
@@ -103,9 +111,9 @@ def hermite_basis(soc_pct: FloatArray, knots_pct: FloatArray = KNOTS_PCT) -> Flo
 
     `soc_pct` is the SoC [%] of shape (n,).
     """
-    bend = hermite_slopes(knots_pct, np.eye(knots_pct.size))
+    slopes = hermite_slopes(knots_pct, np.eye(knots_pct.size))
     left, (h00, h10, h01, h11), _ = _cubics(knots_pct, soc_pct)
-    basis = h10[:, None] * bend[left] + h11[:, None] * bend[left + 1]
+    basis = h10[:, None] * slopes[left] + h11[:, None] * slopes[left + 1]
     row = np.arange(left.size)
     basis[row, left] += h00
     basis[row, left + 1] += h01
@@ -136,13 +144,8 @@ class HermiteCurve:
         secant = np.diff(value) / np.diff(soc_pct)
         flatter = np.minimum(np.r_[secant[0], secant], np.r_[secant, secant[-1]])
         limited = np.clip(slope, FLATTEST_SECANT * flatter, STEEPEST_SECANT * flatter)
-        inner = _cubic(np.arange(secant.size), np.diff(soc_pct), np.array([0.0, 0.5, 1.0])[:, None])
         for _ in soc_pct:  # a changed slope can make the next interval fall
-            # The slope between knots is a parabola in t: d0 + b t + a t², lowest at −b / 2a.
-            d0, d_half, d1 = inner.sum(inner.slope, value, slope)
-            a, b = 2.0 * (d0 - 2.0 * d_half + d1), 4.0 * d_half - 3.0 * d0 - d1
-            t = np.clip(np.divide(-b, 2.0 * a, out=np.zeros_like(a), where=a > 0.0), 0.0, 1.0)
-            falls = np.minimum(np.minimum(d0, d1), d0 + (b + a * t) * t) <= 0.0
+            falls = _lowest_slopes(soc_pct, value, slope) <= 0.0
             if not falls.any():
                 break
             slope = np.where(np.r_[falls, False] | np.r_[False, falls], limited, slope)
@@ -156,17 +159,28 @@ class HermiteCurve:
         """Return voltage [V] and slope [V per %] at one SoC [%]."""
         knots, value, slope = self._lists
         cubic = cubic_at(knots, soc_pct)
-        return cubic.sum(cubic.value, value, slope), cubic.sum(cubic.slope, value, slope)
+        return cubic.values(value, slope), cubic.slopes(value, slope)
 
     def values(self, soc_pct: FloatArray) -> FloatArray:
         """Return voltages [V] at SoC [%] of shape (n,)."""
-        cubics = _cubics(self.soc_pct, soc_pct)
-        return np.asarray(cubics.sum(cubics.value, self.value, self.slope))
+        return np.asarray(_cubics(self.soc_pct, soc_pct).values(self.value, self.slope))
 
     def slopes(self, soc_pct: FloatArray) -> FloatArray:
         """Return slopes [V per %] at SoC [%] of shape (n,)."""
-        cubics = _cubics(self.soc_pct, soc_pct)
-        return np.asarray(cubics.sum(cubics.slope, self.value, self.slope))
+        return np.asarray(_cubics(self.soc_pct, soc_pct).slopes(self.value, self.slope))
+
+
+def _lowest_slopes(soc_pct: FloatArray, value: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return the lowest slope between each two knots [V per %], shape (n − 1,).
+
+    The slope is a parabola in the fraction t of the interval, d = d0 + b·t + a·t².
+    """
+    places = np.arange(soc_pct.size - 1)
+    ends_and_middle = _cubic(places, np.diff(soc_pct), np.array([0.0, 0.5, 1.0])[:, None])
+    d0, d_half, d1 = ends_and_middle.slopes(value, slope)
+    a, b = 2.0 * (d0 - 2.0 * d_half + d1), 4.0 * d_half - 3.0 * d0 - d1
+    t = np.clip(np.divide(-b, 2.0 * a, out=np.zeros_like(a), where=a > 0.0), 0.0, 1.0)
+    return np.asarray(np.minimum(np.minimum(d0, d1), d0 + (b + a * t) * t))
 
 
 def _scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:

@@ -66,9 +66,9 @@ def resistance_factor(temperature_c: ArrayLike) -> FloatArray:
 
 
 class Functions(Fields):
-    """Principal components of the covariance of the curve's and the load's coefficients together.
+    """Principal components of the uncertainty of curve and load coefficients together.
 
-    A function is the part of a component in the voltage, at an amplitude of one standard deviation.
+    Each is scaled so that its amplitude has a standard deviation of 1.
     """
 
     soc_pct: Knots
@@ -110,9 +110,7 @@ class Functions(Fields):
             A row of `VoltageModel.load_columns`.
         """
         cubic = cubic_at(self.soc_pct, soc_pct)
-        return np.asarray(
-            cubic.sum(cubic.value, self.value, self.slope) + load @ self.load_parts(load.size)
-        )
+        return np.asarray(cubic.values(self.value, self.slope) + load @ self.load_parts(load.size))
 
 
 def past_currents(

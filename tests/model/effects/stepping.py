@@ -97,5 +97,5 @@ def step_through(
             asked = counted if asked_soc_pct is None else float(asked_soc_pct[len(readings)])
             readings.append(reading)
             soc.append(counted)
-            volts.append(online.pseudo_ocv_at(asked)[0] + online.load @ online.load_coefficients)
+            volts.append(online.pseudo_ocv_at(asked)[0] + online.load_v)
     return Stepped(readings, np.array(soc), np.array(volts))
