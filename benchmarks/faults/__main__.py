@@ -1,9 +1,10 @@
 """Inject faults on a live bus and print a table of the results.
 
     make faults
-    PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both] [--json]
+    PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both]
 
-Prints the estimated time first. Exit status 1 if a fault failed, or if no run could be judged.
+Says first how long it takes, then each verdict as it falls, and the table at the end; writes each
+row to `out/faults/BUS.jsonl`. Exit status 1 if a fault failed, or if no run could be judged.
 """
 
 from __future__ import annotations
@@ -14,13 +15,12 @@ import os
 import shlex
 import subprocess
 import sys
-import threading
 import time
 from fnmatch import fnmatchcase
-from typing import Any
+from pathlib import Path
+from typing import Final
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from cangauge.bus.open import has_socketcan
 from faults.catalogue import EVERYTHING, ON_ANY_BUS, ON_UDP, ON_VCAN
@@ -28,9 +28,12 @@ from faults.criteria import Row, show
 from faults.fault import Fault
 from faults.line import udp, vcan
 from faults.process import prepare
-from faults.run import Jobs, run_all, seconds
+from faults.run import Jobs, Result, run_all, seconds
 
-ERR = Console(stderr=True)
+ERR = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+ROWS: Final = Path(__file__).resolve().parents[2] / "out" / "faults"
+LIMIT_S: Final = 25 * 60.0
+"""Time after which no run of a bus begins [s]; a part of the nightly has 35 min."""
 
 
 def main() -> int:
@@ -41,41 +44,28 @@ def main() -> int:
             sys.stdout.write(f"{name}: {fault.description}\n")
         return 0
     chosen = _chosen(options.only)
+    on_vcan = None
+    if options.bus == "both" and options.socketcan:
+        on_vcan = _start_on_vcan(options, chosen)
     prepare()
     rows: list[Row] = []
     if options.bus in {"udp", "both"}:
-        faults = [fault for fault in ON_UDP if fault.name in chosen]
-        on_vcan = None
-        if options.bus == "both" and options.socketcan:
-            on_vcan = _VcanRun(options, chosen)
-        rows += _run("udp", faults, options)
-        if on_vcan is not None:
-            rows += on_vcan.rows()
+        rows += _run("udp", [fault for fault in ON_UDP if fault.name in chosen], options)
     if options.bus == "vcan" or (options.bus == "both" and not options.socketcan):
         with_any = options.only and options.bus == "vcan"
         on_bus = [*ON_ANY_BUS, *ON_VCAN] if with_any else ON_VCAN
         faults = list({fault.name: fault for fault in on_bus if fault.name in chosen}.values())
         rows += _run("vcan", faults, options)
-    failed = [row for row in rows if row.verdict is not None and not row.verdict.passed]
-    judged = any(row.verdict is not None for row in rows)
-    if options.json:
-        found = {
-            "seed": options.seed,
-            "faults": len({row.name for row in rows}),
-            "failed": len(failed),
-            "skipped": sum(row.verdict is None for row in rows),
-            "rows": [row.as_json() for row in rows],
-        }
-        sys.stdout.write(json.dumps(found) + "\n")
-    else:
-        console = Console(width=max(Console().width, 170))
-        show(rows, console)
-        skipped = sum(row.verdict is None for row in rows)
-        console.print(
-            f"{len(rows)} runs: {len(rows) - len(failed) - skipped} passed, {len(failed)} failed,"
-            f" {skipped} skipped; seed {options.seed}"
-        )
-    return 1 if failed or not judged else 0
+    failed = sum(row.verdict is not None and not row.verdict.passed for row in rows)
+    unjudged = sum(row.verdict is None for row in rows)
+    console = Console(width=max(Console().width, 170))
+    show(rows, console)
+    console.print(
+        f"{len(rows)} runs: {len(rows) - failed - unjudged} passed, {failed} failed,"
+        f" {unjudged} skipped or void; seed {options.seed}"
+    )
+    failed_on_vcan = on_vcan is not None and _failed_on_vcan(on_vcan)
+    return 1 if failed or failed_on_vcan or unjudged == len(rows) else 0
 
 
 def _options() -> argparse.Namespace:
@@ -98,7 +88,6 @@ def _options() -> argparse.Namespace:
         "--jobs-real", type=int, default=Jobs.real, help="parallel runs in real time"
     )
     parser.add_argument("--list", action="store_true", help="print the names of all faults")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser.parse_args()
 
 
@@ -113,27 +102,29 @@ def _chosen(patterns: list[str] | None) -> set[str]:
 
 
 def _run(bus: str, faults: list[Fault], options: argparse.Namespace) -> list[Row]:
+    """Run faults on a bus; say and write each row as soon as it is known."""
     able, rows = _able(bus, faults)
     if not able:
         return rows
     jobs = Jobs(options.jobs, options.jobs_real)
-    takes = seconds(able, jobs) / 60
-    ERR.print(f"{bus}: {len(able)} faults, about {takes:.0f} min ({os.cpu_count()} cores)")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())  # fmt: skip
-    with Progress(*columns, console=ERR) as progress:
-        task = progress.add_task(
-            bus, total=len(able) + len({fault.reference_key for fault in able})
-        )
+    ERR.print(
+        f"{bus}: {len(able)} faults, about {seconds(able, jobs) / 60:.0f} min"
+        f" ({os.cpu_count()} cores); no run begins after {LIMIT_S / 60:.0f} min"
+    )
+    began_s = time.monotonic()
+    lines = udp if bus == "udp" else vcan
+    ROWS.mkdir(parents=True, exist_ok=True)
+    with (ROWS / f"{bus}.jsonl").open("w", encoding="utf-8", buffering=1) as written:
+        for result in run_all(able, lines, jobs, options.seed, until_s=began_s + LIMIT_S):
+            row = _row(bus, result)
+            rows.append(row)
+            written.write(json.dumps(row.as_json()) + "\n")
+            ERR.print(f"{time.monotonic() - began_s:5.0f} s {bus}: {row.name}: {row.result()}")
+    return rows
 
-        def over(name: str) -> None:
-            progress.update(task, advance=1, description=f"{bus}: {name}")
-            if not ERR.is_terminal:
-                ERR.print(f"{bus}: {name}: finished")
 
-        lines = udp if bus == "udp" else vcan
-        done = run_all(able, lines, jobs, options.seed, progress=over)
-    return [Row.of(each.fault, bus, each.verdict, each.reason) for each in done] + rows
+def _row(bus: str, result: Result) -> Row:
+    return Row.of(result.fault, bus, result.verdict, f"void: {result.reason}")
 
 
 def _able(bus: str, faults: list[Fault]) -> tuple[list[Fault], list[Row]]:
@@ -143,7 +134,7 @@ def _able(bus: str, faults: list[Fault]) -> tuple[list[Fault], list[Row]]:
     for fault in faults:
         why = [lacking[need] for need in sorted(fault.needs) if need in lacking]
         if why:
-            rows.append(Row.of(fault, bus, None, "; ".join(why)))
+            rows.append(Row.of(fault, bus, None, f"skipped: {'; '.join(why)}"))
         else:
             able.append(fault)
     return able, rows
@@ -175,36 +166,25 @@ def _can_make_vcan() -> bool:
     return has_socketcan(line.channel)
 
 
-class _VcanRun:
-    """The faults on vcan, run in parallel by this program under the --socketcan command."""
+def _start_on_vcan(options: argparse.Namespace, chosen: set[str]) -> subprocess.Popen[bytes]:
+    """Run the faults of vcan at the same time, by this program under the --socketcan command."""
+    command = [
+        *shlex.split(options.socketcan), sys.executable, "-m", "faults", "--bus", "vcan",
+        "--seed", str(options.seed), "--jobs", "1", "--jobs-real", "3",
+    ]  # fmt: skip
+    for fault in ON_VCAN:
+        if fault.name in chosen:
+            command += ["--only", fault.name]
+    return subprocess.Popen(command, stdout=subprocess.PIPE)
 
-    def __init__(self, options: argparse.Namespace, chosen: set[str]) -> None:
-        command = [
-            *shlex.split(options.socketcan), sys.executable, "-m", "faults", "--bus", "vcan",
-            "--json", "--seed", str(options.seed), "--jobs", "1", "--jobs-real", "3",
-        ]  # fmt: skip
-        for fault in ON_VCAN:
-            if fault.name in chosen:
-                command += ["--only", fault.name]
-        self._out = b""
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE)
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-        time.sleep(1.0)
 
-    def _read(self) -> None:
-        self._out, _ = self._process.communicate()
-
-    def rows(self) -> list[Row]:
-        """Wait for the rows."""
-        self._thread.join()
-        try:
-            found: dict[str, Any] = json.loads(self._out)
-        except ValueError:
-            raise SystemExit(
-                f"the run on vcan ended with status {self._process.returncode}"
-            ) from None
-        return [Row.from_json(row) for row in found["rows"]]
+def _failed_on_vcan(process: subprocess.Popen[bytes]) -> bool:
+    """Wait for the table of vcan and print it; return whether the run failed."""
+    table, _ = process.communicate()
+    sys.stdout.write(table.decode(errors="replace"))
+    if process.returncode not in {0, 1}:
+        ERR.print(f"the run on vcan ended with status {process.returncode}")
+    return process.returncode != 0
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import Any, Final
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from cangauge._typing import FloatArray
 from cangauge.types import Reason, reason_name
@@ -343,9 +344,9 @@ class Row:
     bus : str
         "udp" or "vcan".
     verdict : Verdict, optional
-        None if it was skipped.
+        None if it was skipped, or is void.
     reason : str
-        Why it was skipped.
+        Why it has none.
     """
 
     name: str
@@ -371,16 +372,11 @@ class Row:
             row["verdict"] = {"passed": self.verdict.passed, **found}
         return row
 
-    @classmethod
-    def from_json(cls, row: dict[str, Any]) -> Row:
-        """Return the row of `as_json`."""
-        found = row["verdict"]
-        if found is None:
-            return cls(**row)
-        numbers = {key: math.nan if value is None else value for key, value in found.items()}
-        del numbers["passed"]
-        numbers["failures"] = tuple(numbers["failures"])
-        return cls(**{**row, "verdict": Verdict(**numbers)})
+    def result(self) -> str:
+        """Return the result in words."""
+        if self.verdict is None:
+            return self.reason
+        return "pass" if self.verdict.passed else f"FAIL: {'; '.join(self.verdict.failures)}"
 
 
 def show(rows: list[Row], console: Console) -> None:
@@ -404,9 +400,8 @@ def show(rows: list[Row], console: Console) -> None:
         found = row.verdict
         head = (row.name, row.description, f"{row.bus}, {row.profile}")
         if found is None:
-            table.add_row(*head, *[""] * 7, f"[yellow]skipped: {row.reason}")
+            table.add_row(*head, *[""] * 7, Text(row.result(), "yellow"))
             continue
-        result = "[green]pass" if found.passed else f"[red]FAIL: {'; '.join(found.failures)}"
         table.add_row(
             *head,
             _number(found.soc_error_pct, 2),
@@ -416,7 +411,7 @@ def show(rows: list[Row], console: Console) -> None:
             _number(found.not_valid_s, 1),
             _number(found.stale_valid_s, 1),
             _number(found.silent_s, 1),
-            result,
+            Text(row.result(), "green" if found.passed else "red"),
         )
     console.print(table)
 

@@ -7,8 +7,8 @@ import queue
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -32,6 +32,10 @@ from faults.process import Target, cangauge
 
 LISTEN_AFTER_S: Final = 1.0
 """Time to listen after the last frame; below the time-outs of the input [s]."""
+
+MAX_SEND_DELAY_S: Final = 1.5
+"""Delay of the harness between frames that makes a run void: it is close to the time-outs of the
+service [s]."""
 
 
 def run_fault(fault: Fault, line: BusLine, seed: int, target: Target = cangauge) -> Observation:
@@ -152,6 +156,8 @@ class _FramePlayer:
                 took_s = observed.sent_s[-1] - observed.sent_s[-2]
                 meant_s = (observed.bus_s[-1] - observed.bus_s[-2]) / self._speed
                 observed.late_s = max(observed.late_s, took_s - meant_s)
+                if observed.late_s > MAX_SEND_DELAY_S:
+                    break
             if send(event.frame) and event.is_good:
                 for role in event.roles:
                     observed.good_sent_s[role].append(observed.sent_s[-1])
@@ -257,14 +263,9 @@ class Jobs:
     real: int = 24
 
 
-MAX_SEND_DELAY_S: Final = 1.5
-"""Delay of the harness between frames that invalidates a run: it is close to the time-outs of the
-service [s]."""
-
-
 @dataclass(frozen=True)
 class Result:
-    """A fault that was run; without a verdict if its undisturbed run is not valid."""
+    """A fault that was run; without a verdict where the run is void, with the reason."""
 
     fault: Fault
     verdict: Verdict | None
@@ -289,6 +290,10 @@ def seconds(faults: list[Fault], jobs: Jobs) -> float:
     return total + max(pools)
 
 
+REPEATS: Final = 5
+"""Most repetitions of a run that the machine's other work made void."""
+
+
 def run_all(
     faults: list[Fault],
     lines: Callable[[int], BusLine],
@@ -296,10 +301,12 @@ def run_all(
     seed: int,
     *,
     target: Target = cangauge,
-    progress: Callable[[str], None] = lambda _name: None,
-    retry_if_disturbed: bool = True,
-) -> list[Result]:
-    """Run faults and their undisturbed runs, and judge them.
+    repeats: int = REPEATS,
+    until_s: float = math.inf,
+) -> Iterator[Result]:
+    """Run faults and their undisturbed runs, and yield each result as soon as it is known.
+
+    A void run is repeated when all others are over, alone on the machine.
 
     Parameters
     ----------
@@ -310,101 +317,113 @@ def run_all(
     seed : int
     target : callable
         The service.
-    progress : callable
-        Called with the name of each finished run.
-    retry_if_disturbed : bool
-        Whether to repeat a run that the machine delayed, and an undisturbed run that is not valid:
-        one at a time, at most `REPEATS` times.
+    repeats : int
+        Most repetitions of a void run.
+    until_s : float
+        Monotonic time after which no run begins [s].
 
-    Returns
-    -------
-    list of Result
-        In the order of `faults`, the undisturbed runs first.
+    Yields
+    ------
+    Result
     """
     runs = _with_undisturbed(faults)
     free: queue.SimpleQueue[BusLine] = queue.SimpleQueue()
     for number in range(jobs.fast + jobs.real):
         free.put(lines(number))
 
-    def one(fault: Fault) -> Observation:
+    def observe(fault: Fault) -> Observation | None:
         line = free.get()
         try:
+            if time.monotonic() > until_s:
+                return None
             return run_fault(fault, line, seed, fault.target or target)
         finally:
             free.put(line)
-            progress(fault.name)
 
-    observed = _run_each(runs, one, jobs)
-    references = _references(runs, observed)
-    # A busy machine disturbs runs too.
-    for _ in range(REPEATS if retry_if_disturbed else 0):
-        again = [
-            number
-            for number, fault in enumerate(runs)
-            if observed[number].late_s > MAX_SEND_DELAY_S
-            or (fault.name == UNDISTURBED and isinstance(references[fault.reference_key], str))
-        ]
-        if not again:
-            break
-        repeated = _run_each([runs[number] for number in again], one, Jobs(1, 1))
-        observed = [*observed]
-        for number, found in zip(again, repeated, strict=True):
-            observed[number] = found
-        references = _references(runs, observed)
-    return [
-        _done(fault, observed[number], references[fault.reference_key])
-        for number, fault in enumerate(runs)
-    ]
+    court = _Court()
+    for fault, observed in _each_once(runs, observe, jobs):
+        yield from court.judge(fault, observed)
+    for _ in range(repeats):
+        for fault in court.void():
+            yield from court.judge(fault, observe(fault))
+    yield from court.unjudged()
 
 
-REPEATS = 5
-"""Repetitions of a run that the machine's other work made void."""
-
-
-def _run_each(
-    runs: list[Fault], one: Callable[[Fault], Observation], jobs: Jobs
-) -> list[Observation]:
+def _each_once(
+    runs: list[Fault], observe: Callable[[Fault], Observation | None], jobs: Jobs
+) -> Iterator[tuple[Fault, Observation | None]]:
     """Run faults in parallel, then one by one those that need the machine alone."""
-    futures: dict[int, Future[Observation]] = {}
     with ThreadPoolExecutor(jobs.fast) as fast, ThreadPoolExecutor(jobs.real) as real:
-        for number, fault in enumerate(runs):
+        futures: dict[Future[Observation | None], Fault] = {}
+        for fault in runs:
             if "alone" not in fault.needs:
                 pool = real if fault.profile.is_real_time else fast
-                futures[number] = pool.submit(one, fault)
+                futures[pool.submit(observe, fault)] = fault
                 # Staggered: simultaneous starts delay each other.
                 time.sleep(0.05)
-    return [
-        futures[number].result() if number in futures else one(fault)
-        for number, fault in enumerate(runs)
-    ]
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    for fault in runs:
+        if "alone" in fault.needs:
+            yield fault, observe(fault)
 
 
-def _references(
-    runs: list[Fault], observed: list[Observation]
-) -> dict[tuple[str, str, str], Reference | str]:
-    return {
-        fault.reference_key: _reference(found)
-        for fault, found in zip(runs, observed, strict=True)
-        if fault.name == UNDISTURBED
-    }
+_Key = tuple[str, tuple[str, str, str]]
 
 
-def _reference(observed: Observation) -> Reference | str:
-    try:
-        return Reference(observed)
-    except ValueError as error:
-        return str(error)
+class _Court:
+    """Judges each run as soon as the undisturbed run that it is compared with is known."""
 
+    def __init__(self) -> None:
+        self._references: dict[tuple[str, str, str], Reference] = {}
+        self._waiting: list[tuple[Fault, Observation]] = []
+        self._void: dict[_Key, Result] = {}
 
-def _done(fault: Fault, observed: Observation, reference: Reference | str) -> Result:
-    if isinstance(reference, str):
-        return Result(fault, None, reference)
-    if observed.late_s > MAX_SEND_DELAY_S:
-        return Result(
-            fault, None, f"the machine delayed frames by {observed.late_s:.1f} s each time"
-        )
-    verdict = judge(observed, reference, reports=fault.reports, recovers=fault.recovers)
-    return Result(fault, verdict)
+    def judge(self, fault: Fault, observed: Observation | None) -> Iterator[Result]:
+        """Take one run; yield the results that are now known."""
+        key = fault.name, fault.reference_key
+        if observed is None:
+            self._void.setdefault(key, Result(fault, None, "no time was left for it"))
+            return
+        reason = self._void_reason(fault, observed)
+        if reason:
+            self._void[key] = Result(fault, None, reason)
+            return
+        self._void.pop(key, None)
+        self._waiting.insert(0, (fault, observed))
+        for each in self._waiting:
+            if each[0].reference_key in self._references:
+                yield self._result(*each)
+        self._waiting = [
+            each for each in self._waiting if each[0].reference_key not in self._references
+        ]
+
+    def void(self) -> list[Fault]:
+        """Return the faults of void runs, undisturbed ones first."""
+        faults = [result.fault for result in self._void.values()]
+        return sorted(faults, key=lambda fault: fault.name != UNDISTURBED)
+
+    def unjudged(self) -> Iterator[Result]:
+        """Yield what stays void, and what has no valid undisturbed run."""
+        yield from self._void.values()
+        for fault, _ in self._waiting:
+            yield Result(fault, None, self._void[UNDISTURBED, fault.reference_key].reason)
+
+    def _void_reason(self, fault: Fault, observed: Observation) -> str:
+        """Return why a run is void, "" if it is not; keep an undisturbed run."""
+        if observed.late_s > MAX_SEND_DELAY_S:
+            return f"the machine delayed its frames by {observed.late_s:.1f} s"
+        if fault.name == UNDISTURBED:
+            try:
+                self._references[fault.reference_key] = Reference(observed)
+            except ValueError as error:
+                return str(error)
+        return ""
+
+    def _result(self, fault: Fault, observed: Observation) -> Result:
+        reference = self._references[fault.reference_key]
+        verdict = judge(observed, reference, reports=fault.reports, recovers=fault.recovers)
+        return Result(fault, verdict)
 
 
 def _with_undisturbed(faults: list[Fault]) -> list[Fault]:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import fakes
 import pytest
 
 from faults import frames as alter
 from faults.catalogue import EVERYTHING, shortened
-from faults.criteria import Row
+from faults.criteria import Observation, Row
 from faults.fault import Fault
 from faults.frames import Profile
 from faults.line import udp
 from faults.process import Target, prepare
-from faults.run import Jobs, Result, run_all
+from faults.run import REPEATS, Jobs, Result, run_all
 
 BRIEF = Profile("brief", 75.0, 60.0, (12.0, 42.0), 8.0)
 """7.5 s; the fakes have no delay line to fill."""
@@ -47,11 +50,13 @@ def results() -> dict[Target, list[Result]]:
 
     def one(number: int) -> list[Result]:
         target = FAKES[number]
-        return run_all(
+        # These have no valid undisturbed run, and a repetition would take as long.
+        repeats = 0 if target in (fakes.hard_to_stop, fakes.never_valid) else REPEATS
+        found = run_all(
             [GONE], lambda line: udp(5 * number + line), Jobs(2, 1), 1, target=target,
-            # These have no valid undisturbed run, and a repetition would take as long.
-            retry_if_disturbed=target not in (fakes.hard_to_stop, fakes.never_valid),
+            repeats=repeats,
         )  # fmt: skip
+        return list(found)
 
     with ThreadPoolExecutor(len(FAKES)) as pool:
         return dict(zip(FAKES, pool.map(one, range(len(FAKES))), strict=True))
@@ -92,5 +97,37 @@ def test_real_service_passes_some_faults() -> None:
     for each in done:
         assert each.verdict is not None, each.reason
         assert each.verdict.failures == (), each.fault.name
-    rows = [Row.of(each.fault, "udp", each.verdict) for each in done]
-    assert [repr(Row.from_json(row.as_json())) for row in rows] == [repr(row) for row in rows]
+
+
+def test_verdicts_fall_one_by_one_and_no_run_begins_after_the_end_of_the_time() -> None:
+    faults = [replace(GONE, name=name) for name in ("first", "second")]
+    found = run_all(
+        faults, lambda line: udp(80 + line), Jobs(1, 1), 1, target=fakes.honest,
+        until_s=time.monotonic() + 2.0,
+    )  # fmt: skip
+    undisturbed = next(found)
+    at_s = time.monotonic()
+    first, second = found
+    assert undisturbed.verdict is not None
+    assert time.monotonic() - at_s < 5.0
+    for each in (first, second):
+        assert each.verdict is None
+        assert each.reason == "no time was left for it"
+        assert json.loads(json.dumps(Row.of(each.fault, "udp", None, each.reason).as_json()))
+
+
+def test_run_that_the_machine_delays_is_repeated_and_then_void(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    delayed = []
+
+    def late(fault: Fault, *_arguments: object) -> Observation:
+        delayed.append(fault.name)
+        return Observation(late_s=2.0)
+
+    monkeypatch.setattr("faults.run.run_fault", late)
+    found = list(run_all([GONE], lambda line: udp(90 + line), Jobs(1, 1), 1, repeats=2))
+    assert delayed.count("gone") == delayed.count("undisturbed") == 3
+    for each in found:
+        assert each.verdict is None
+        assert each.reason == "the machine delayed its frames by 2.0 s"
