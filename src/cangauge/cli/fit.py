@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -36,7 +36,7 @@ more or less in 16 makes three times as much."""
 class PublishedOptions:
     """The options of the published equation."""
 
-    delays: Annotated[
+    delay_s: Annotated[
         str | None,
         option(
             "--delays",
@@ -53,7 +53,7 @@ class PublishedOptions:
             within=(0.0001, 0.49),
         ),
     ] = None
-    t_ref: Annotated[
+    t_ref_c: Annotated[
         float | None,
         option(
             "--t-ref",
@@ -66,18 +66,17 @@ class PublishedOptions:
 
     def given(self, equation: str) -> dict[str, Any]:
         """Return the arguments of `fit` that are given; raise InputError for another equation."""
-        delay_s = None if self.delays is None else _delays_s(self.delays)
-        by_flag = {
-            "--delays": ("delay_s", delay_s),
-            "--epsilon": ("epsilon", self.epsilon),
-            "--t-ref": ("t_ref_c", self.t_ref),
-        }
-        given = {flag: each for flag, each in by_flag.items() if each[1] is not None}
-        if equation != "published" and given:
-            problem = "belongs to the published equation"
-            cure = "add --equation published, or omit it"
-            raise InputError(problem, field=next(iter(given)), cure=cure)
-        return dict(given.values())
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        if self.delay_s is not None:
+            given["delay_s"] = _delays_s(self.delay_s)
+        if given and equation != "published":
+            raise InputError(
+                "--delays, --epsilon and --t-ref belong to the published equation",
+                field="--equation",
+                value=equation,
+                cure="add --equation published, or omit them",
+            )
+        return given
 
 
 @command()

@@ -19,52 +19,67 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
         [Ah].
     noise : Noise
     """
-    knots = isinstance(model.curve, HermiteCurve)
-    prefix = "loads" if knots else "published.coefficients"
-    middle = model.nominal_v
+    _check_curve(model)
+    _check_sizes(model, capacity_ah, noise)
+    _check_sign(model)
+
+
+def _has_knots(model: VoltageModel) -> bool:
+    return isinstance(model.curve, HermiteCurve)
+
+
+def _check_curve(model: VoltageModel) -> None:
     ends = model.pseudo_ocv([*model.range.soc_pct]).tolist()
-    low, high = min(*ends, middle), max(*ends, middle)
+    low, high = min(*ends, model.nominal_v), max(*ends, model.nominal_v)
     # Lithium cells are used between 2.0 and 4.4 V, lead and nickel cells over a narrower range;
     # vehicles and stores stay below 1.5 kV.
     if not (low > 0.0 and high <= min(1e4, 3.0 * low)):
         raise InputError(
             f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
-            field="curve.voltage_v" if knots else prefix,
+            field="curve.voltage_v" if _has_knots(model) else "published.coefficients",
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-    # With all of its voltage dropped at 1 C a pack could not be discharged in an hour at all: 0.02
-    # for a Leaf, 0.3 for a small cell in the cold.
-    loads, most_ohm = model.loads, middle / capacity_ah
-    limits = [
-        (
-            f"{prefix}.resistance_ohm.{k}" if knots else f"{prefix}.R{k + 1}",
-            ohm,
-            most_ohm,
-            "ohm",
-        )
-        for k, ohm in enumerate(loads.resistance_ohm)
-    ]
-    kt = f"{prefix}.{'kt_v_per_k' if knots else 'kt'}"
-    # Relative to the voltage 0.002 as published for a Leaf, 0.0003 by the entropy of the cells.
-    limits.append((kt, loads.kt_v_per_k, 0.01 * middle, "V/K"))
-    noises = ("level_std_v", "slow_std_v", "fast_std_v")
-    limits += [(f"noise.{name}", getattr(noise, name), middle, "V") for name in noises]
-    for field, value, most, unit in limits:
-        if abs(value) > most:
-            raise InputError(
-                f"must lie within ±{most:.3g} {unit} for a pack of {middle:.4g} V and"
-                f" {capacity_ah:.4g} Ah",
-                field=field,
-                value=value,
-                cure="check the value and its unit, or the capacity",
-            )
+
+
+def _check_sizes(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:
+    middle_v, loads = model.nominal_v, model.loads
+    if _has_knots(model):
+        ohm_field, first, kt_field = "loads.resistance_ohm.", 0, "loads.kt_v_per_k"
+    else:
+        ohm_field, first, kt_field = "published.coefficients.R", 1, "published.coefficients.kt"
+    ohms = {f"{ohm_field}{k}": ohm for k, ohm in enumerate(loads.resistance_ohm, start=first)}
+    noise_v = {
+        f"noise.{name}": getattr(noise, name)
+        for name in ("level_std_v", "slow_std_v", "fast_std_v")
+    }
+    for values, most, unit in (
+        # With all of its voltage dropped at 1 C a pack could not be discharged in an hour at all:
+        # 0.02 for a Leaf, 0.3 for a small cell in the cold.
+        (ohms, middle_v / capacity_ah, "ohm"),
+        # Relative to the voltage 0.002 as published for a Leaf, 0.0003 by the entropy of the cells.
+        ({kt_field: loads.kt_v_per_k}, 0.01 * middle_v, "V/K"),
+        (noise_v, middle_v, "V"),
+    ):
+        for field, value in values.items():
+            if abs(value) > most:
+                raise InputError(
+                    f"must lie within ±{most:.3g} {unit} for a pack of {middle_v:.4g} V and"
+                    f" {capacity_ah:.4g} Ah",
+                    field=field,
+                    value=value,
+                    cure="check the value and its unit, or the capacity",
+                )
+
+
+def _check_sign(model: VoltageModel) -> None:
     # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
     # the spread of their resistances in the covariance, so that a wrong sign is within it.
-    (low_a, high_a), lasting_ohm = model.range.current_a, sum(loads.resistance_ohm)
-    if not knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
+    (low_a, high_a), lasting_ohm = model.range.current_a, sum(model.loads.resistance_ohm)
+    most_v = RESISTANCE_AT_LEAST * model.nominal_v
+    if not _has_knots(model) and lasting_ohm * (high_a - low_a) > most_v:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",
-            field=prefix,
+            field="published.coefficients",
             value=lasting_ohm,
             cure="positive current discharges, so resistances are negative",
         )
