@@ -135,16 +135,17 @@ class ExtendedModel:
         out_ah = discharged_ah(signals.time_s, counting.counted(signals.current_a))
         moved_pct = 100.0 * (out_ah - out_ah[initial_row]) / counting.capacity_ah
         soc = np.asarray(counting.initial_soc_pct - moved_pct)
-        every = any(effect.adds_voltage for effect, _ in effects)
-        rows = slice(None) if every else at_rows
+        # An effect that adds a voltage remembers: it needs every row.
+        is_whole = any(effect.adds_voltage for effect, _ in effects)
+        rows = slice(None) if is_whole else at_rows
         if currents_a is not None and signals.current_a is measured_a:
             currents = currents_a[rows]
         else:
             currents = model.currents(signals.time_s, signals.current_a, rows)
         temperature_c = signals.temperature_c[rows]
-        columns = model.load_columns(temperature_c, currents)
-        volts = columns @ model.load_coefficients
-        drop_v = columns[:, 1:] @ model.load_coefficients[1:]
+        load_columns = model.load_columns(temperature_c, currents)
+        volts = load_columns @ model.load_coefficients
+        drop_v = load_columns[:, 1:] @ model.load_coefficients[1:]
         inputs = Inputs(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
         over_soc = []
         for effect, values in effects:
@@ -155,7 +156,7 @@ class ExtendedModel:
                 over_soc.append((effect, values, drive[at_rows]))
             else:
                 volts = volts + drive
-        if every:
+        if is_whole:
             volts, currents = volts[at_rows], currents[at_rows]
         prediction = Prediction(at_rows, volts, signals, soc, currents, volts, over_soc)
         return replace(prediction, voltage_v=self.voltage_at(soc[at_rows], prediction))
