@@ -32,7 +32,9 @@ PRELOAD: Final = [
     "can.interfaces.socketcan",
 ]
 _COLD: Final = "from cangauge.__main__ import main; main()"
-_STARTING: Final = threading.Lock()
+_CHILDREN: Final = threading.Lock()
+"""Held while a process starts and while its status is read: a start reads the status of every
+process that has ended, and it can be read only once."""
 
 
 def cangauge(arguments: list[str]) -> None:
@@ -99,7 +101,7 @@ class Process:
             child = CONTEXT.Process(
                 target=_enter, args=(self._target, self._arguments, str(self._log))
             )
-            with _STARTING:
+            with _CHILDREN:
                 child.start()
             self._child = child
         self.started_s = time.monotonic()
@@ -151,7 +153,8 @@ class Process:
         child = self._child
         if child is None:
             return 0
-        return child.poll() if isinstance(child, subprocess.Popen) else child.exitcode
+        with _CHILDREN:
+            return child.poll() if isinstance(child, subprocess.Popen) else child.exitcode
 
     def _wait(self, seconds: float) -> int | None:
         until = time.monotonic() + seconds

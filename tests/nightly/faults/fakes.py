@@ -115,3 +115,12 @@ def never_valid(arguments: list[str]) -> None:
 def does_not_start(arguments: list[str]) -> None:
     """Ends immediately."""
     sys.exit(f"error: {arguments[2]}: nothing is right")
+
+
+def waits(arguments: list[str]) -> None:
+    """Do nothing until SIGTERM."""
+    del arguments
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    print("ready", flush=True)
+    while True:
+        signal.pause()

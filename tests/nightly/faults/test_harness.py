@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import forkserver
+from pathlib import Path
 
 import fakes
 import pytest
@@ -16,7 +19,7 @@ from faults.criteria import Observation, Row
 from faults.fault import Fault
 from faults.frames import Profile
 from faults.line import udp
-from faults.process import Target, prepare
+from faults.process import Process, Target, prepare
 from faults.run import REPEATS, Jobs, Result, run_all
 
 BRIEF = Profile("brief", 75.0, 60.0, (12.0, 42.0), 8.0)
@@ -131,3 +134,32 @@ def test_run_that_the_machine_delays_is_repeated_and_then_void(
     for each in found:
         assert each.verdict is None
         assert each.reason == "the machine delayed its frames by 2.0 s"
+
+
+def test_status_at_the_end_is_right_while_other_processes_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # multiprocessing asks for the status of all its processes wherever one starts; the status
+    # is in a pipe, and of two threads that read it the second finds none.
+    read, readers = forkserver.read_signed, []
+
+    def first_slowly(pipe: int) -> int:
+        readers.append(pipe)
+        if len(readers) == 1:
+            time.sleep(0.5)
+        return read(pipe)
+
+    process = Process([], tmp_path / "first.txt", fakes.waits)
+    process.start()
+    while not process.output():
+        time.sleep(0.01)
+    monkeypatch.setattr(forkserver, "read_signed", first_slowly)
+    stopping = threading.Thread(target=process.stop)
+    stopping.start()
+    while not readers:
+        time.sleep(0.01)
+    other = Process([], tmp_path / "other.txt", fakes.waits)
+    other.start()
+    stopping.join()
+    other.kill()
+    assert process.incidents == []
