@@ -8,7 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from days import FAULTS, day, more_amperes, more_resistance, more_volts, scaled_volts, wrong_start
+from days import (
+    FAULTS,
+    day,
+    more_amperes,
+    more_resistance,
+    more_volts,
+    resistance_step,
+    scaled_volts,
+    wrong_start,
+)
 
 from cangauge.diagnosis import FAULTS as NINE
 from cangauge.diagnosis import Diagnosis, Healthy, Posterior, diagnose
@@ -278,6 +287,20 @@ def test_a_correction_that_makes_the_soc_worse_is_refused(known: Healthy, model:
     assert not refused.is_written
     assert refused.why_not == "the SoC error of these logs would grow with it"
     assert refused.why_not in refused.summary
+
+
+def test_a_step_of_resistance_is_judged_where_it_happened(known: Healthy, model: Model) -> None:
+    """The model that is written has it from the first row on, and is wrong before it."""
+    log = resistance_step(day(20), 0.08)
+    assert log.soc_pct is not None
+    beyond = replace(log, soc_pct=log.soc_pct - 10.0 * (log.time_s > 1400.0))
+    kept, refused = (
+        judged(diagnose([each], model, known), resistance_step=1.0) for each in (log, beyond)
+    )
+    assert kept.is_written
+    assert kept.soc_errors_pct is not None
+    assert kept.soc_errors_pct[1] < 0.5 * kept.soc_errors_pct[0]
+    assert not refused.is_written
 
 
 @pytest.mark.parametrize(

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Final
 
 import numpy as np
 
-from cangauge._typing import BoolArray
+from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.diagnosis.evidence import Evidence
-from cangauge.diagnosis.pack import LogRows
+from cangauge.diagnosis.pack import Healthy, LogRows
 from cangauge.diagnosis.rows import Simulated, added
-from cangauge.diagnosis.sizes import SizeProfile
+from cangauge.diagnosis.shapes import Shape
+from cangauge.diagnosis.sizes import folds
 from cangauge.diagnosis.where import Errors, rms
+from cangauge.estimation.offline import estimate
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
+
+SETTLING_S: Final = 300.0
+"""With its start withheld, an estimate of the SoC counts from here on [s]."""
 
 
 def errors_of(given: Sequence[Simulated], logs: Sequence[LogRows]) -> Errors:
@@ -38,9 +45,25 @@ def errors_of(given: Sequence[Simulated], logs: Sequence[LogRows]) -> Errors:
     return Errors(*map(np.concatenate, zip(*parts, strict=True)))
 
 
+def soc_errors_pct(model: Model, log: LogRows) -> FloatArray:
+    """Return the absolute error of the SoC on the rows that count, start withheld [%].
+
+    NaN while the estimate settles, where it gives no SoC, and for a log that mostly has none.
+    """
+    of, own_pct = log.trace.log, log.trace.log.soc_pct
+    at = log.trace.rows[log.kept]
+    if own_pct is None or np.isfinite(own_pct).mean() < 0.5:
+        return np.full(at.size, np.nan)
+    known = np.isfinite(own_pct)
+    table = estimate(replace(of, soc_pct=None), model, initial_soc_pct="auto")
+    error_pct = np.abs(table.soc_pct - np.interp(of.time_s, of.time_s[known], own_pct[known]))
+    is_settled = of.time_s - of.time_s[0] >= SETTLING_S
+    return np.asarray(np.where(is_settled, error_pct, np.nan)[at])
+
+
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The given model with one effect.
+    """One effect that corrects a model.
 
     Parameters
     ----------
@@ -52,25 +75,6 @@ class Correction:
     evidence: Evidence
     errors: Errors = field(repr=False)
 
-    @classmethod
-    def of(
-        cls,
-        evidence: Evidence,
-        folds: Sequence[tuple[SizeProfile, list[BoolArray]]],
-        logs: Sequence[LogRows],
-        given: Sequence[Simulated],
-        without: Errors,
-    ) -> Correction:
-        """Return the correction by an effect, judged on parts of logs that did not size it."""
-        after_v = [errors.before_v for errors in without.by_log]
-        for profile, judged in folds:
-            size = profile.sized(evidence)
-            for k, (shape, rows) in enumerate(zip(evidence.shapes, judged, strict=True)):
-                if shape is not None and rows.any():
-                    found = given[k].with_effect(shape.effect, shape.values(size))
-                    after_v[k] = np.where(rows, found.residual_v[logs[k].kept], after_v[k])
-        return cls(evidence, replace(without, after_v=np.concatenate(after_v)))
-
     @property
     def rmse_v(self) -> float:
         """Error of the corrected model [V]."""
@@ -78,8 +82,9 @@ class Correction:
 
     @property
     def is_better(self) -> bool:
-        """Whether the error of rows that did not size it is smaller with it."""
-        return self.rmse_v < rms(self.errors.before_v)
+        """Whether the voltage error shrinks for certain."""
+        _, most = self.errors.growth(self.errors.before_v**2, self.errors.after_v**2)
+        return most < 0.0
 
     @property
     def is_of_log(self) -> bool:
@@ -92,6 +97,77 @@ class Correction:
         if shape.place is not None:
             shape = replace(shape, place=0.0).in_log(0.0)
         return added(given, shape.effect, shape.values(self.evidence.size))
+
+
+class HeldOut:
+    """Logs of which one part after the other is held out, to judge what corrects a model.
+
+    Parameters
+    ----------
+    model : Model
+    extended : ExtendedModel
+        The same model.
+    healthy : Healthy
+    logs : sequence of LogRows
+    """
+
+    def __init__(
+        self, model: Model, extended: ExtendedModel, healthy: Healthy, logs: Sequence[LogRows]
+    ) -> None:
+        self._model, self._extended, self._logs = model, extended, logs
+        self._simulated = [Simulated(extended, log.trace) for log in logs]
+        self._folds = folds(healthy, logs)
+        self.errors = errors_of(self._simulated, logs)
+        """Without a correction."""
+
+    @cached_property
+    def soc_errors_pct(self) -> FloatArray:
+        """SoC errors without a correction [%]."""
+        return np.concatenate([soc_errors_pct(self._model, log) for log in self._logs])
+
+    def correction(self, evidence: Evidence) -> Correction:
+        """Return the correction by an effect."""
+        after_v = self._judged(evidence, self.errors.before_v, self._voltage_errors_v)
+        return Correction(evidence, replace(self.errors, after_v=after_v))
+
+    def corrected_soc_errors_pct(self, correction: Correction) -> FloatArray:
+        """Return the SoC errors with a correction, sized without the rows that are judged [%]."""
+        errors_with = partial(self._soc_errors_pct, correction.rmse_v)
+        return self._judged(correction.evidence, self.soc_errors_pct, errors_with)
+
+    def keeps_soc(self, correction: Correction) -> bool:
+        """Whether the SoC error does not grow for certain."""
+        if correction.is_of_log or not np.isfinite(self.soc_errors_pct).any():
+            return True
+        after_pct = self.corrected_soc_errors_pct(correction)
+        least, _ = self.errors.growth(self.soc_errors_pct, after_pct)
+        return least <= 0.0
+
+    def _judged(
+        self,
+        evidence: Evidence,
+        before: FloatArray,
+        errors_with: Callable[[int, Shape, float], FloatArray],
+    ) -> FloatArray:
+        """Return errors on all rows that count, each part of the logs with its size by the others.
+
+        `errors_with` returns those of a log with a shape at a size.
+        """
+        after = [before[self.errors.log == k] for k in range(len(self._logs))]
+        for profile, judged in self._folds:
+            size = profile.sized(evidence)
+            for k, (shape, rows) in enumerate(zip(evidence.shapes, judged, strict=True)):
+                if shape is not None and rows.any():
+                    after[k] = np.where(rows, errors_with(k, shape, size), after[k])
+        return np.concatenate(after)
+
+    def _voltage_errors_v(self, k: int, shape: Shape, size: float) -> FloatArray:
+        corrected = self._simulated[k].with_effect(shape.effect, shape.values(size))
+        return corrected.residual_v[self._logs[k].kept]
+
+    def _soc_errors_pct(self, rmse_v: float, k: int, shape: Shape, size: float) -> FloatArray:
+        corrected = added(self._extended, shape.effect, shape.values(size))
+        return soc_errors_pct(model_file(self._model, corrected, rmse_v), self._logs[k])
 
 
 def model_file(given: Model, corrected: ExtendedModel, rmse_v: float) -> Model:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,7 +16,13 @@ from cangauge._typing import FloatArray
 from cangauge.diagnosis import text
 from cangauge.diagnosis.as_json import as_json
 from cangauge.diagnosis.checks import check_logs
-from cangauge.diagnosis.correction import Correction, errors_of, model_file
+from cangauge.diagnosis.correction import (
+    Correction,
+    HeldOut,
+    errors_of,
+    model_file,
+    soc_errors_pct,
+)
 from cangauge.diagnosis.evidence import Evidence, analyse, learn
 from cangauge.diagnosis.model_check import ModelCheck, check_model
 from cangauge.diagnosis.next_step import next_step
@@ -25,10 +30,9 @@ from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
 from cangauge.diagnosis.posterior import ALARM, Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
-from cangauge.diagnosis.sizes import folds, sized_by_simulation
+from cangauge.diagnosis.sizes import sized_by_simulation
 from cangauge.diagnosis.where import Errors, closed_part, excesses, rms
 from cangauge.errors import InputError
-from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import soc_at_first_row
@@ -36,10 +40,6 @@ from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model, as_model
 
 _LOG = logging.getLogger(__name__)
-
-WORSE_SOC_PCT, SETTLING_S = 0.25, 300.0
-"""A correction is refused if the SoC error of these logs grows by more with it [%]: on healthy
-trips of one car it scatters by as much. The first seconds, with withheld start, do not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,23 +97,21 @@ class Diagnosis:
     @cached_property
     def _baseline(self) -> Errors:
         """Errors by the model as given."""
-        return errors_of(self._simulated(self.model.extended_model()), self.rows)
+        return self._errors_by(self.model.extended_model())
+
+    def _errors_by(self, model: ExtendedModel) -> Errors:
+        return errors_of([Simulated(model, log.trace) for log in self.rows], self.rows)
 
     @cached_property
-    def _uncorrected(self) -> Errors:
-        """Errors by the model of the healthy logs."""
-        return errors_of(self._simulated(self._healthy_extended), self.rows)
-
-    def _simulated(self, model: ExtendedModel) -> list[Simulated]:
-        return [Simulated(model, log.trace) for log in self.rows]
+    def _held_out(self) -> HeldOut:
+        """The logs by the model of the healthy logs, to judge corrections."""
+        return HeldOut(self._healthy_model, self._healthy_extended, self.healthy, self.rows)
 
     @cached_property
     def corrections(self) -> dict[str, Correction]:
         """Fault → its best effect, judged on rows that did not size it."""
-        parts, given = folds(self.healthy, self.rows), self._simulated(self._healthy_extended)
         return {
-            fault: Correction.of(self.best_of(fault), parts, self.rows, given, self._uncorrected)
-            for fault in self.posterior.faults
+            fault: self._held_out.correction(self.best_of(fault)) for fault in self.posterior.faults
         }
 
     def best_of(self, fault: str) -> Evidence:
@@ -122,10 +120,10 @@ class Diagnosis:
 
     @cached_property
     def correction(self) -> Correction | None:
-        """The correction by the most probable stated fault that makes left-out errors smaller."""
+        """The correction by the most probable stated fault that is no worse on left-out rows."""
         for fault in self.posterior.stated:
             found = self.corrections[fault]
-            if found.is_better and self._keeps_soc(found):
+            if found.is_better and self._held_out.keeps_soc(found):
                 return found
         return None
 
@@ -140,7 +138,7 @@ class Diagnosis:
             return "no fault is stated"
         if any(self.corrections[fault].is_better for fault in self.posterior.stated):
             return "the SoC error of these logs would grow with it"
-        return "it does not make the error of left-out rows smaller"
+        return "it does not surely make the voltage error of left-out rows smaller"
 
     @property
     def is_written(self) -> bool:
@@ -160,45 +158,23 @@ class Diagnosis:
         """
         if "start" in self.posterior.stated:
             return None
-        before = self._soc_error_pct(self.model)
-        if math.isnan(before):
+        before = after = self._soc_errors_pct(self.model)
+        if self.correction is not None:
+            after = self._held_out.corrected_soc_errors_pct(self.correction)
+        elif self.lacks:
+            after = self._soc_errors_pct(self._healthy_model)
+        known = np.isfinite(before) & np.isfinite(after)
+        if not known.any():
             return None
-        return before, self._soc_error_pct(self.extended_model) if self.is_written else before
+        return float(before[known].mean()), float(after[known].mean())
 
-    def _keeps_soc(self, correction: Correction) -> bool:
-        """Whether the SoC error of these logs grows by no more than its scatter.
-
-        A step of resistance within these logs is not tested: the corrected model has the step from
-        the first row on, and is wrong before it.
-        """
-        if correction.is_of_log or correction.evidence.shape.place is not None:
-            return True
-        before = self._soc_error_pct(self._healthy_model)
-        return not self._soc_error_pct(self._file(correction)) > before + WORSE_SOC_PCT
-
-    def _soc_error_pct(self, model: Model) -> float:
-        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%].
-
-        NaN where none has one, infinite where the model gives no SoC.
-        """
-        errors: list[FloatArray] = []
-        for log, rows in zip(self.logs, self.rows, strict=True):
-            if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
-                continue
-            known = np.isfinite(log.soc_pct)
-            table = estimate(replace(rows.trace.log, soc_pct=None), model, initial_soc_pct="auto")
-            own = np.interp(table.time_s, log.time_s[known], log.soc_pct[known])
-            settled = table.time_s - table.time_s[0] >= SETTLING_S
-            errors.append(np.abs(table.soc_pct - own)[np.isfinite(table.soc_pct) & settled])
-        if not errors:
-            return math.nan
-        together = np.concatenate(errors)
-        return float(together.mean()) if together.size else math.inf
+    def _soc_errors_pct(self, model: Model) -> FloatArray:
+        return np.concatenate([soc_errors_pct(model, log) for log in self.rows])
 
     @property
     def errors(self) -> Errors:
         """Errors on the rows that count, by the model as given and by the corrected one."""
-        corrected = self._uncorrected if self.correction is None else self.correction.errors
+        corrected = (self.correction or self._held_out).errors
         return replace(self._baseline, after_v=corrected.after_v)
 
     @property
@@ -270,7 +246,7 @@ class Diagnosis:
         """The model that describes the healthy logs: the given one where nothing is missed."""
         if not self.lacks:
             return self.model
-        left_v = rms(self._uncorrected.before_v)
+        left_v = rms(self._errors_by(self._healthy_extended).before_v)
         return model_file(self.model, self._healthy_extended, left_v)
 
     def _file(self, correction: Correction) -> Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -70,6 +71,24 @@ class Errors:
         sums = np.bincount(self.piece, weights=values)
         draw = np.random.default_rng(0).integers(0, sums.size, (DRAWS, sums.size))
         return np.asarray(sums[draw].sum(axis=1))
+
+    def growth(self, before: FloatArray, after: FloatArray) -> tuple[float, float]:
+        """Return how much larger a mean error is after than before, as its 95 % interval.
+
+        By a bootstrap over pieces, on the rows where both are finite; infinite where there is none.
+
+        Parameters
+        ----------
+        before, after : array of shape (m,)
+            An error of each row, absolute or squared.
+        """
+        known = np.isfinite(before) & np.isfinite(after)
+        if not known.any():
+            return math.inf, math.inf
+        rows = self.drawn(known.astype(np.float64))
+        change = self.drawn(np.where(known, after - before, 0.0))
+        low, high = np.quantile(change[rows > 0.0] / rows[rows > 0.0], [0.025, 0.975])
+        return float(low), float(high)
 
 
 def rms(errors_v: FloatArray) -> float:
