@@ -47,6 +47,7 @@ def row_of(case: dict[str, Any], k: int) -> str:
                "filetime": int(10_000_000 * (START.timestamp() + k + 11_644_473_600)),
                "net_ticks": int(10_000_000 * (START.timestamp() + k + 62_135_596_800))}  # fmt: skip
     way, way_cn = ("Discharging", "恒流放电") if i > 0.0 else ("Charging", "恒流充电")
+    values["flag"] = str(i < 0.0).upper()
     return template.format(k=k, size=abs(i), way=way, way_cn=way_cn, **values)
 
 

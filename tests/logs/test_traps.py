@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pyarrow as pa
@@ -125,6 +126,14 @@ def test_arrow_times_have_their_own_unit(kind: Any, unit: str) -> None:
     frame = pa.table({"time": counts.cast(kind(unit)), **columns})
     log = Log.from_dataframe(frame, temperature_c=20.0)
     np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+def test_arrow_times_of_day_are_clock_times() -> None:
+    counts = pa.array(86_370 + np.arange(60), pa.int32())
+    clock = pa.array([k % 86_400 for k in counts.to_pylist()], pa.int32()).cast(pa.time32("s"))
+    columns = {"current": np.arange(60.0) % 7, "voltage": np.full(60, 360.0)}
+    log = Log.from_dataframe(pa.table({"time": clock, **columns}), temperature_c=20.0)
+    np.testing.assert_array_equal(log.time_s - log.time_s[0], np.arange(60.0))
 
 
 def test_a_factor_states_the_sign(tmp_path: Path) -> None:
@@ -250,6 +259,37 @@ def test_cures_taken_literally_lead_to_the_truth(
     np.testing.assert_allclose(log.current_a, current)
     np.testing.assert_allclose(log.voltage_v, 380.0 - current / 10.0)
     np.testing.assert_allclose(log.temperature_c, 20.0)
+
+
+# ---- daylight saving time
+
+
+def local_rows(month: int, day: int) -> list[str]:
+    """Return rows of Berlin's clock from three minutes before it changes in UTC."""
+    start = datetime(2024, month, day, 0, 57, tzinfo=UTC)
+    times = [
+        (start + timedelta(seconds=k)).astimezone(ZoneInfo("Europe/Berlin")) for k in range(400)
+    ]
+    return [f"{time:%Y-%m-%d %H:%M:%S},{k % 7},360,20" for k, time in enumerate(times)]
+
+
+@pytest.mark.parametrize(("month", "day"), [(3, 31), (10, 27)])
+def test_a_stated_zone_tells_the_hours_that_a_clock_skips_or_repeats(
+    tmp_path: Path, month: int, day: int
+) -> None:
+    columns = "time=Time[Europe/Berlin]"
+    log = read(tmp_path, "Time,Current,Voltage,Temp", local_rows(month, day), columns)
+    np.testing.assert_array_equal(log.time_s - log.time_s[0], np.arange(400.0))
+    assert log.time_s[0] == datetime(2024, month, day, 0, 57, tzinfo=UTC).timestamp()
+
+
+def test_without_a_zone_a_change_of_the_clock_is_said(tmp_path: Path) -> None:
+    head, cure = "Time,Current,Voltage,Temp", r"--columns 'time=Time\[Europe/Berlin\]'"
+    log = read(tmp_path, head, local_rows(3, 31))
+    said = f"skips an hour at row 181, .*{cure}"
+    assert any(re.search(said, remark) for remark in log.remarks)
+    with pytest.raises(InputError, match=f"goes back by an hour at row 181.*{cure}"):
+        read(tmp_path, head, local_rows(10, 27))
 
 
 # ---- the choice of columns

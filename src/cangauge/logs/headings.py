@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 from cangauge.logs.quantities import QUANTITIES, WORDS
+from cangauge.logs.stamps import is_time_format
 from cangauge.settings import TemperatureSource
 
 LONGEST: Final = 200
@@ -198,12 +199,12 @@ def _meaning(name: str, unit: str) -> Meaning | None:
     others = {*words} - (_LETTERS.keys() if names.isdisjoint(words) else names)
     ticks = [word for word in words if word in WORDS["ticks"]]
     if quantity == "time":
-        if _CLOCK.match(unit):
+        if _CLOCK.match(unit) and not is_time_format(unit):
             unit = ""
         if ticks and not unit:  # TimeUS
             unit = ticks[-1]
             others.discard(unit)
-    if unit and of.scale_of(unit) is None:
+    if unit and of.scale_of(unit) is None and not (quantity == "time" and is_time_format(unit)):
         return None
     in_name = re.findall(r"[\[(]([^\[\]()]*)[\])]", name) + name.split("/")[1:]
     if not unit and any(_is_unit(text.strip().lower()) for text in in_name if text.strip()):

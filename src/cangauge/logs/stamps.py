@@ -6,6 +6,7 @@ only differences matter.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final
@@ -21,7 +22,7 @@ from cangauge.logs.quantities import EPOCHS, LIMITS, unit_of
 from cangauge.logs.values import first_text, is_number, numbers_of, typical, unit_in_cell
 
 _CLOCK: Final = (
-    r"(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
+    r"(?P<h>\d{1,5}):(?P<m>\d{1,2}(?:[.,]\d+)?)(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?"
 )
 _DATE: Final = (
@@ -32,7 +33,9 @@ _ZONE: Final = (
     r"(?:(?P<z>Z|z|UTC|GMT)|[A-Z]{3,5})?\s*(?:(?P<sign>[+-])(?P<zh>\d{2}):?(?P<zm>\d{2})?)?"
 )
 _DATE_TIME: Final = rf"^{_DATE}(?:(?:[T,_]|\s)\s*{_CLOCK})?\s*{_ZONE}$"
-_CLOCK_TIME: Final = rf"^(?:(?P<d>\d+)\s*(?:[dD]|[dD]ays?)?\s+)?{_CLOCK}$"
+_CLOCK_TIME: Final = rf"^(?:(?P<d>\d+)\s*(?:[dD]|[dD]ays?)?,?\s+)?{_CLOCK}$"
+_TWO_PARTS: Final = re.compile(r"h+:m+|m+:s+(?:[.,]\w+)?", re.IGNORECASE)
+"""Units of clock times of two parts."""
 _SPELLINGS: Final = (
     ("[\u00a0\u202f]", " "),  # before AM and PM
     # `Mar 31, 2024` and `31 March 2024` are read as `31-Mar-2024`.
@@ -74,6 +77,11 @@ def is_clock(text: str) -> bool:
     return bool(_match([text], _CLOCK_TIME)[0])
 
 
+def is_time_format(unit: str) -> bool:
+    """Return whether a unit is an order of dates (`dmy`) or of a clock's two parts (`mm:ss`)."""
+    return unit.lower() in _ORDERS or _TWO_PARTS.fullmatch(unit) is not None
+
+
 def _match(cells: Sequence[str], pattern: str) -> BoolArray:
     alike = _spelled_alike(pa.array(cells, pa.string()))
     return np.asarray(pc.match_substring_regex(alike, pattern), dtype=bool)
@@ -97,7 +105,8 @@ def seconds_of(
         Numbers, timestamps, durations, dates, or text of any of them; several are texts to join.
     unit : str
         Unit of numbers ("": seconds, or as the size of an epoch shows), order of dates (`dmy`,
-        `mdy`), or the zone of dates that state none (`Europe/Berlin`).
+        `mdy`) or of a clock's two parts (`h:mm`, `mm:ss`), or the zone of dates that state none
+        (`Europe/Berlin`).
     factor : float
         Numbers times this are in the unit.
     source, label : str
@@ -108,7 +117,7 @@ def seconds_of(
     InputError
         If a cell is no time.
     """
-    is_format = unit.lower() in _ORDERS or _zone_of(unit) is not None
+    is_format = is_time_format(unit) or _zone_of(unit) is not None
     order_or_zone = unit if is_format else ""
     column, kind = parts[0], parts[0].type
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
@@ -116,7 +125,7 @@ def seconds_of(
     if len(parts) > 1:
         joined = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
         return seconds_of_text(joined, order_or_zone, source, label)
-    if pa.types.is_date(kind):
+    if pa.types.is_date(kind) or pa.types.is_time(kind):
         column = column.cast(pa.string())
     first = first_text(column)
     if first and not is_number(first) and unit_of("time_s", unit_in_cell(first)) is None:
@@ -213,7 +222,24 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     of_day_s = np.where(read, hours * 3600.0 + minutes * 60.0 + seconds, np.nan)
     if not is_clock_time:
         return _dates(parts, of_day_s, unit)
+    if not np.isfinite(_numbers(parts, "s")).any() and _are_minutes(parts, unit, source, label):
+        of_day_s /= 60.0
     return over_midnight(np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s), "clock time"
+
+
+def _are_minutes(parts: Any, unit: str, source: str, label: str) -> bool:
+    """Return whether clock times of two parts are minutes and seconds, not hours and minutes."""
+    if pc.any(pc.match_substring_regex(parts.field("m"), "[.,]")).as_py():
+        return True
+    if _TWO_PARTS.fullmatch(unit):
+        return unit[:1].lower() == "m"
+    hours = np.nan_to_num(_numbers(parts, "h"))
+    if np.max(hours) < 24.0 and np.any(np.diff(hours) < 0.0):  # from 23:59 to 0:00
+        return False
+    problem = "it may be hours and minutes, or minutes and seconds"
+    shown = f"{hours[-1]:.0f}:{_numbers(parts, 'm')[-1]:02.0f}"
+    cure = f"state it: --columns 'time={label}[h:mm]', or [mm:ss]"
+    raise InputError(problem, source=source, field=label, value=shown, cure=cure)
 
 
 def _iso_dates(cells: Any, unit: str) -> tuple[FloatArray, str] | None:
@@ -264,8 +290,13 @@ def _in_zone(values: FloatArray, how: str, unit: str) -> tuple[FloatArray, str]:
     if zone is None:
         return values, f"{how} without zone"
     local = pa.array(values * 1e6, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
-    utc = pc.assume_timezone(local, zone.key, ambiguous="earliest", nonexistent="latest")
-    return _since_1970(utc), f"{how} in {zone.key}"
+    first_s, again_s = (
+        _since_1970(pc.assume_timezone(local, zone.key, ambiguous=which, nonexistent="latest"))
+        for which in ("earliest", "latest")
+    )
+    # Of an hour that the clock shows twice, the rows below its step back are the second one.
+    is_again = np.cumsum(np.diff(values, prepend=values[:1]) < 0.0) > 0
+    return np.where(is_again, again_s, first_s), f"{how} in {zone.key}"
 
 
 def _order(fields: FloatArray, unit: str, *, is_word: bool) -> tuple[str, str]:

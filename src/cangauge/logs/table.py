@@ -9,7 +9,7 @@ only those that changed.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
@@ -30,7 +30,7 @@ from cangauge.logs.columns import (
     refuse_odd_names,
 )
 from cangauge.logs.draft import COUNTER, MAX_INCOMPLETE, DraftLog
-from cangauge.logs.headings import Rank, charge_scale
+from cangauge.logs.headings import Rank, charge_scale, parse_heading
 from cangauge.logs.log import SOURCE
 from cangauge.logs.quantities import (
     FIELDS,
@@ -49,13 +49,21 @@ MAX_COUNTERS: Final = 6
 HOLD_S: Final = 1.0
 """Longest time over which a voltage is held or interpolated to a row with a current [s], where each
 channel has times of its own: a bus repeats both within it."""
+HOUR_S: Final = 3600.0
+"""Change of a local clock at daylight saving time [s]."""
 _STATES: Final = re.compile(
     r"(?<![a-z])(?:state|status|md|mode|direction|dir|type|step|command|(?:dis)?charg(?:e|ing))"
     "(?![a-z])|状态|类型"
 )
 """Words of a heading that may tell the direction of an unsigned current."""
+_UNITS: Final = re.compile(r"(?:^|[^a-z])(?:units?|einheit|unité)$", re.IGNORECASE)
+"""Heading of a column that states the unit of the one before it."""
 _CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])|充"
 _DISCHARGES: Final = r"(?:^|[^a-z])(?:d|dis[a-z]*|dch[a-z]*)(?:$|[^a-z])|放"
+_FLAG: Final = re.compile(r"(?:is)?\W*_?(?:state|status|flag)?\W*", re.IGNORECASE)
+"""What beside `charging` makes a heading that its cells affirm or deny."""
+_YES: Final = "^(?:1|1[.]0|true|yes|on)$"
+_NO: Final = "^(?:0|0[.]0|false|no|off)$"
 _LEAF_SPY: Final = {"Gids", "AHr", "Pack Volts"}
 """Columns of a LeafSpy log, whose SoC is in ten-thousandths of a percent."""
 
@@ -104,13 +112,17 @@ def draft_of_table(
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
     wanted += [*words, *(place for place, _ in chosen["time"].others)]
+    beside = {k: k + 1 for k in wanted if _UNITS.search("".join(headings[k + 1 : k + 2]))}
+    wanted += beside.values()
     counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, wanted)
     cells = table.columns([*dict.fromkeys([*wanted, *counters])])
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
-    for quantity in chosen:
-        take = _take_time if quantity == "time" else _take
-        column, unit = take(draft, quantity, chosen[quantity], cells)
-        chosen[quantity] = column
+    units = {place: _only_word(cells[k], where, headings[k]) for place, k in beside.items()}
+    for quantity, column in chosen.items():
+        if quantity == "time":
+            chosen[quantity], unit = _take_time(draft, column, cells)
+        else:
+            unit = _take(draft, quantity, column, cells, units)
         if not choice.is_canonical:
             factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
             label = draft.labels[FIELDS[quantity]]
@@ -126,7 +138,7 @@ def draft_of_table(
     if choice.is_canonical:
         word = table.word or word
     for place in words:
-        word = _only_word(cells[place], where) or word
+        word = _only_word(cells[place], where, SOURCE) or word
     draft.temperature_source = known_temperature_source(word, source=where)
     if not choice.is_canonical:
         _direct(draft, chosen["current"], table)
@@ -142,23 +154,30 @@ def _counters(table: TextTable | ArrowTable, taken: Sequence[int]) -> dict[int, 
     return found if len(found) <= MAX_COUNTERS else {}
 
 
-def _only_word(column: Any, where: str) -> str:
+def _only_word(column: Any, where: str, label: str) -> str:
     words = {str(word).strip().lower() for word in pc.unique(column.cast(pa.string())).to_pylist()}
     words -= {"", "none"}
     if len(words) > 1:
         problem = "the column must hold one word throughout"
-        raise InputError(problem, source=where, field=SOURCE, value=sorted(words)[:3])
+        raise InputError(problem, source=where, field=label, value=sorted(words)[:3])
     return words.pop() if words else ""
 
 
 def _take(
-    draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]
-) -> tuple[ChosenColumn, str]:
-    """Take a quantity in its canonical unit; return its column, and how the unit was found."""
+    draft: DraftLog,
+    quantity: str,
+    column: ChosenColumn,
+    cells: dict[int, Any],
+    units: Mapping[int, str],
+) -> str:
+    """Take a quantity in its canonical unit; return how the unit was found.
+
+    `units` are those that a column beside states, by place.
+    """
     name, where, unit = FIELDS[quantity], draft.where, column.unit
     texts = _label(draft, name, column, " − " if quantity == "current" else " + ")
     read = [numbers_of(cells[k], where, text) for k, text in zip(column.places, texts, strict=True)]
-    for _, in_cells in read:
+    for in_cells in [*(unit for _, unit in read), *(units.get(k, "") for k in column.places)]:
         if in_cells and unit and unit_of(name, in_cells) != unit_of(name, unit):
             problem = "the cells have another unit than the heading"
             cure = f"state the right one: --columns '{quantity}=HEADING[UNIT]'"
@@ -176,7 +195,7 @@ def _take(
         how = f"{how}, the median"
     else:
         draft.values[name] = _discharge_less_charge(draft, parts)
-    return column, how
+    return how
 
 
 def _unit_of_soc(draft: DraftLog, soc: FloatArray, unit: str, how: str) -> tuple[str, str]:
@@ -224,9 +243,14 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
     ]
     for place, column in table.columns(places).items() if places else ():
         cells = pc.fill_null(pc.utf8_lower(column.cast(pa.string())), "")
+        flag = parse_heading(headings[place])
+        ways = [_CHARGES, _DISCHARGES]
+        if flag.way and _FLAG.fullmatch(flag.name.replace(flag.way, "")):
+            answers = (_NO, _YES) if flag.is_discharge else (_YES, _NO)
+            ways = [f"{words}|{answer}" for words, answer in zip(ways, answers, strict=True)]
         charges, discharges = (
             np.asarray(pc.match_substring_regex(cells, words), dtype=bool) & (current > 0.0)
-            for words in (_CHARGES, _DISCHARGES)
+            for words in ways
         )
         is_direction = "direction" in headings[place].lower() and len(pc.unique(cells)) > 1
         if not (charges.any() and discharges.any()) and not is_direction:
@@ -244,13 +268,13 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
 
 
 def _take_time(
-    draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]
+    draft: DraftLog, column: ChosenColumn, cells: dict[int, Any]
 ) -> tuple[ChosenColumn, str]:
     """Take the time [s]; return its column and its reading; of several, one that increases.
 
     A date beside a clock time is read with it, unless the user named the clock.
     """
-    name, where = FIELDS[quantity], draft.where
+    name, where = FIELDS["time"], draft.where
 
     def read(column: ChosenColumn) -> tuple[FloatArray, str]:
         _label(draft, name, column, " + ")
@@ -274,12 +298,28 @@ def _take_time(
     if known_s.size > 1 and known_s.min() == known_s.max():
         cure = "name another one: --columns time=…"
         raise draft.error(name, "this column does not move: it is no time", cure, float(known_s[0]))
+    if "without zone" in how:
+        _refuse_clock_change(draft, time_s)
     draft.values[name] = time_s
     if how == "s, assumed":
         draft.in_seconds = False if column.is_stated else None
     elif unit_of(name, how) is None:  # dates, clock times, ticks since a date
         draft.in_seconds = True
     return column, how
+
+
+def _refuse_clock_change(draft: DraftLog, time_s: FloatArray) -> None:
+    """Raise InputError where dates go back by an hour; remark where they skip one."""
+    step = np.diff(time_s[np.isfinite(time_s)])
+    usual_s = float(np.median(step)) if step.size else 0.0
+    label = draft.labels["time_s"]
+    cure = f"state the zone of its dates, such as --columns 'time={label}[Europe/Berlin]'"
+    for row in np.flatnonzero(np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s):
+        change = "goes back by" if step[row] < 0.0 else "skips"
+        problem = f"the clock {change} an hour at row {row + 2}, as at daylight saving time"
+        if step[row] < 0.0:
+            raise draft.error("time_s", problem, cure)
+        draft.remarks.append(f"{problem}: if no hour is missing there, {cure}")
 
 
 def _label(draft: DraftLog, name: str, column: ChosenColumn, joint: str) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain, product, repeat
+from itertools import product, repeat
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
@@ -122,13 +122,14 @@ class TextTable(NamedTuple):
         first = next((line for line in self.head.lines[self.skip_lines :] if line.strip()), "")
         if not first:
             raise self._error("there are no rows below the header", "check the export")
-        width = len(split_cells(first, self.delimiter))
-        if not max(places) < width <= MAX_COLUMNS:
+        cells = split_cells(first, self.delimiter)
+        is_shifted = any(cells[len(self.headings) :])  # by an index without a heading
+        if is_shifted or not max(places) < len(cells) <= MAX_COLUMNS:
             named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
-            problem = f"row 1 has {width} cells where the header has {named}"
-            cure = "the file looks cut off or has another delimiter: export it again"
+            problem = f"row 1 has {len(cells)} cells where the header has {named}"
+            cure = "the file lacks a heading, is cut off or has another delimiter: export it"
             raise self._error(f"{problem} (at most {MAX_COLUMNS})", cure)
-        return width
+        return len(cells)
 
     def _remark_odd(self, odd_rows: list[Any], rows: int) -> None:
         # pyarrow numbers rows from 1, skipped lines included; only the last ones may be odd.
@@ -172,11 +173,13 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         if bare is not None:
             return bare
     canonical = None
-    for table in chain(headed(head, rows=1), headed(head, rows=2)):
+    headers = ((table, rows) for rows in (1, 2) for table in headed(head, rows))
+    for table, rows in headers:
         with suppress(InputError):  # no column has a heading that the user names
             choice = choose_columns(table.headings, (), given)
             if choice.is_complete:
-                return _above_data(table, choice, given)
+                units = _units_above(table, table.skip_lines - rows, choice)
+                return _above_data(table._replace(units=units), choice, given)
             if choice.is_canonical and canonical is None:
                 canonical = _above_data(table, choice, given)
     return canonical
@@ -203,7 +206,7 @@ def _above_data(table: TextTable, choice: Choice, given: ColumnMap | None) -> Te
     """
     chosen = choice.chosen
     measured = [chosen[name].places[-1] for name in NEEDED if name in chosen]
-    units, first = list[str](), table.skip_lines
+    units, first = table.units, table.skip_lines
     for number, line in enumerate(table.head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
         row = split_cells(line, table.delimiter)
         cell = next((row[k] for k in measured if k < len(row) and row[k]), "")
@@ -213,6 +216,20 @@ def _above_data(table: TextTable, choice: Choice, given: ColumnMap | None) -> Te
         if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
             units = row
     return table._replace(units=units)
+
+
+def _units_above(table: TextTable, header: int, choice: Choice) -> list[str]:
+    """Return the row above the header if it holds a unit of every quantity; [] if not."""
+    above = next((line for line in table.head.lines[:header][::-1] if line.strip()), "")
+    row = split_cells(above, table.delimiter)
+    if len(row) != len(table.headings):
+        return []
+    scales = (
+        unit_of(FIELDS[name], row[place].strip("()[]"))
+        for name, column in choice.chosen.items()
+        for place in column.places
+    )
+    return [] if choice.is_canonical or None in scales else row
 
 
 def _repeats_units(row: Sequence[str], choice: Choice) -> bool:

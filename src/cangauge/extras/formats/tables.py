@@ -32,6 +32,7 @@ POLLED_SHARE: Final = 0.1
 """Share of values that repeat the one before from which they are polled, not stored on change [-]:
 of many series some, such as the temperature, hardly move."""
 DAY_S: Final = 86_400.0
+_VALUE: Final = r"^(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{0,4})$"
 
 
 class Workbook:
@@ -176,12 +177,21 @@ class LongTable(Channels):
         stamps_s, how = seconds_of([cells[time]], "", 1.0, source=source, label=label)
         if np.max(stamps_s, initial=0.0) < DAY_S:  # seconds of the day
             stamps_s = over_midnight(stamps_s)
+        values, in_cells = _numbers_and_units(cells[value])
         parts = [words[place] for place in varying]
-        parts += [pc.binary_join_element_wise("[", words[place], "]", "") for place in units]
+        parts += [
+            pc.binary_join_element_wise("[", unit, "]", "")
+            for unit in [*(words[place] for place in units), in_cells]
+        ]
         names = pc.utf8_trim_whitespace(pc.binary_join_element_wise(*parts, " "))
-        names = pc.replace_substring(names, " []", "").combine_chunks().dictionary_encode()
+        names = pc.replace_substring(names, " []", "")
+        names = names.combine_chunks().dictionary_encode()
         names_of = " and ".join(text.headings[place] for place in varying)
-        return cls(names_of, label, how, _by_name(names, stamps_s, _numbers(cells[value])))
+        series = _by_name(names, stamps_s, values)
+        if not series:
+            problem, label = "no value is a number", text.headings[value]
+            raise InputError(problem, source=source, field=label, cure="check the export")
+        return cls(names_of, label, how, series)
 
     @property
     def headings(self) -> list[str]:
@@ -258,12 +268,15 @@ def _time_of(text: TextTable) -> str:
     return min(times, key=itemgetter(0), default=(0, ""))[1]
 
 
-def _numbers(cells: Any) -> FloatArray:
-    """Return the numbers in cells, NaN where a word ("unavailable") ends a value."""
-    if is_text(cells):
-        is_number = pc.match_substring_regex(cells, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-        cells = pc.if_else(is_number, cells, pa.scalar(None, pa.string()))
-    return np.asarray(pc.cast(cells, pa.float64()).to_numpy())
+def _numbers_and_units(cells: Any) -> tuple[FloatArray, Any]:
+    """Return the numbers in cells, NaN where a word ends a value, and the units behind them."""
+    if not is_text(cells):
+        return np.asarray(pc.cast(cells, pa.float64()).to_numpy()), pa.repeat("", len(cells))
+    parts = pc.extract_regex(cells.combine_chunks(), _VALUE)
+    is_number = pc.is_valid(parts)
+    texts = pc.if_else(is_number, parts.field("number"), pa.scalar(None, pa.string()))
+    numbers = pc.cast(texts, pa.float64()).to_numpy(zero_copy_only=False)
+    return np.asarray(numbers), pc.if_else(is_number, parts.field("unit"), "")
 
 
 READERS: Final = (Workbook(), LongTable)
