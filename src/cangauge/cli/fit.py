@@ -186,7 +186,7 @@ def fit_command(
     """
     from cangauge.identify.fit import fit
 
-    starts = _starts_pct(initial_soc, len(logs))
+    starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
     of_equation = published.given(equation)
     check_outputs([output, report], logs)
     with progress("cangauge.identify") as show:
@@ -194,7 +194,7 @@ def fit_command(
         result = fit(
             recorded,
             capacity_ah=capacity_ah,
-            initial_soc_pct=starts,
+            initial_soc_pct=starts if len(starts) > 1 else starts[0],
             equation=equation,
             chemistry=chemistry,
             cells=cells or _cells_of(recorded[0], reading),
@@ -210,20 +210,6 @@ def fit_command(
     found = result.to_dict() | {"assumed": assumed_of(recorded)}
     files = {"model": output, "report": report}
     finish(found, partial(_show, result), files, as_json=json_output)
-
-
-def _starts_pct(given: list[Any] | None, logs: int) -> Any:
-    """Return the SoC at the start of all logs, or of each [%]; None where it is unknown."""
-    starts = [None if each == "auto" else each for each in given or ["auto"]]
-    if len(starts) == 1:
-        return starts[0]
-    if len(starts) != logs:
-        raise InputError(
-            f"{len(starts)} values for {logs} logs",
-            field="--initial-soc",
-            cure="give one for all, or one for each log in order (auto where it is unknown)",
-        )
-    return starts
 
 
 def _cells_of(log: Log, reading: ReadingOptions) -> int | None:

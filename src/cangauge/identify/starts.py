@@ -104,12 +104,12 @@ def given_starts(
     if len(given) != number:
         raise InputError(
             f"{len(given)} values for {number} logs",
-            field="initial_soc_pct",
+            field="--initial-soc",
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
     for value in given:
         if value is not None and not 0.0 <= value <= 100.0:
-            raise InputError("must lie within 0 … 100 %", field="initial_soc_pct", value=value)
+            raise InputError("must lie within 0 … 100 %", field="--initial-soc", value=value)
     return given
 
 
