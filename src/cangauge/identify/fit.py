@@ -12,10 +12,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._files import text_sha256
-from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError, require_choice, require_number
-from cangauge.identify.effect_search import Search, Selected, linearize, parse_effect_ids
+from cangauge.identify.effect_search import parse_effect_ids
 from cangauge.identify.identification import (
     Identification,
     evaluate,
@@ -23,17 +22,8 @@ from cangauge.identify.identification import (
     remarks_on_logs,
     remarks_on_rows,
 )
-from cangauge.identify.least_squares import (
-    BASE,
-    LOGS_AT_LEAST,
-    N,
-    P,
-    Solution,
-    log_sums,
-    row_features,
-    solve_scaled,
-)
-from cangauge.identify.published import PublishedEquation, PublishedFit
+from cangauge.identify.knots import fit_knots
+from cangauge.identify.published import PublishedEquation, fit_published
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts
 from cangauge.logs.charge import refuse_contradictions
@@ -41,18 +31,11 @@ from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
 from cangauge.model.curve import KNOTS_PCT
-from cangauge.model.effects.base import Effect, Values
-from cangauge.model.effects.library import effect_entries
-from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import Information, Made, Model, SourceLog
-from cangauge.model.noise import Noise
-from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior, principal_functions
+from cangauge.model.model_file import Made, SourceLog
+from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
 from cangauge.model.voltage_model import DELAYS_S, Ranges
 
 Equation = Literal["knots", "published"]
-
-RELINEARIZED: Final = 4
-"""Gauss–Newton steps of a fit with effects: enough for products of effects and resistances."""
 
 CELLS_TOLERANCE: Final = 0.1
 """Voltage of a cell relative to the nearer typical one, from which the number of cells must be
@@ -143,17 +126,18 @@ def fit(
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in known]
         _check_rows(rows)
         fields = _fields(recorded, rows, cells, options)
+        selected = None
         if equation == "knots":
-            fitted = _fit_knots(rows, pack, effect_ids, fields)
+            model, published, errors_v, selected = fit_knots(rows, pack, effect_ids, fields)
         else:
-            fitted = _fit_published(rows, replace(published_equation, delay_s=delays), fields)
-        model, published, held_out_error_v, selected = fitted
+            published_equation = replace(published_equation, delay_s=delays)
+            model, published, errors_v = fit_published(rows, published_equation, fields)
         extended = model.extended_model()
         fits = tuple(evaluate(extended, item) for item in rows)
     return Identification(
         model=model,
         published=published,
-        held_out_error_v=held_out_error_v,
+        held_out_error_v=errors_v,
         effects=selected,
         starts=tuple(starts),
         fits=fits,
@@ -338,197 +322,6 @@ def _mean_point(
             row, start_pct = 0, given_pct
         total_pct += float(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0).sum())
     return total_v / rows, total_pct / rows
-
-
-_Fitted = tuple[Model, PublishedFit, tuple[FloatArray, ...], Selected | None]
-"""Model, published equation, errors of left-out logs, and effects if any were asked for."""
-
-
-def _fit_knots(
-    rows: Sequence[FitRows],
-    pack: PackPrior,
-    effect_ids: Sequence[str],
-    fields: dict[str, Any],
-) -> _Fitted:
-    """Return the fit of a curve of knots, with the effects that are asked for."""
-    equation = PublishedEquation()
-    published = equation.fit(rows, [equation.root(item) for item in rows])
-    if usable_delays([item.log for item in rows], DELAYS_S) == DELAYS_S and published.identified:
-        fields = fields | {"published": published.fields()}
-    solution, without = solve_scaled([log_sums(item, pack.chemistry) for item in rows], pack)
-    errors_v = _comparable(
-        rows,
-        [
-            item.voltage_v - item.product(row_features, other.of_columns)
-            for item, other in zip(rows, without, strict=False)  # none for too few logs
-        ],
-    )
-    effects: tuple[tuple[Effect, Values], ...] = ()
-    selected: Selected | None = None
-    if effect_ids:
-        search = Search(knots_model(solution, fields).extended_model(), rows, pack, effect_ids)
-        while (selected := search.select()).chosen:
-            with_effects = _with_effects(solution, rows, selected, pack, fields)
-            at_bound = selected.at_bound(with_effects[0])
-            if not at_bound:
-                solution, effects, errors_v = with_effects
-                break
-            search.refused += at_bound
-    fields = fields | {"effects": effect_entries(effects)}
-    model = knots_model(solution, fields, errors_v, rows)
-    return model, published, errors_v, selected
-
-
-def _with_effects(
-    plain: Solution,
-    rows: Sequence[FitRows],
-    selected: Selected,
-    pack: PackPrior,
-    fields: dict[str, Any],
-) -> tuple[Solution, tuple[tuple[Effect, Values], ...], tuple[FloatArray, ...]]:
-    """Fit the selected effects too, by Gauss–Newton steps from the solution without effects.
-
-    Returns
-    -------
-    solution : Solution
-    effects : tuple of (Effect, values)
-    errors_v : tuple of array of shape (m,)
-        Errors of left-out logs [V].
-    """
-    solution, std = plain, selected.amplitude_std
-    extended = knots_model(solution, fields).extended_model()
-    amplitudes = np.zeros(std.size)
-    for _ in range(RELINEARIZED):
-        about = [linearize(extended, item, selected, amplitudes) for item in rows]
-        volts = [item.explained_v(solution.of_columns[:BASE], amplitudes) for item in about]
-        tables = [item.table for item in about]
-        sums = [
-            log_sums(item.rows, pack.chemistry, table, volts_of_log)
-            for item, table, volts_of_log in zip(about, tables, volts, strict=True)
-        ]
-        solution, without = solve_scaled(sums, pack, std)
-        solution = selected.clipped(solution)
-        amplitudes = solution.coefficients[P:]
-        effects = selected.effects(solution)
-        voltage = knots_model(solution, fields).voltage_model()
-        extended = ExtendedModel(voltage, pack.capacity_ah, effects)
-    errors_v = [
-        volts_of_log - table @ other.of_columns
-        for volts_of_log, table, other in zip(volts, tables, without, strict=False)
-    ]
-    return solution, effects, _comparable([item.rows for item in about], errors_v)
-
-
-def knots_model(
-    solution: Solution,
-    fields: dict[str, Any],
-    held_out_v: Sequence[FloatArray] = (),
-    rows: Sequence[FitRows] = (),
-) -> Model:
-    """Return the model of a solution.
-
-    Parameters
-    ----------
-    solution : Solution
-        With its covariance already scaled by left-out logs.
-    fields : dict
-        The other fields of `Model`.
-    held_out_v : sequence of array of shape (m,)
-        Errors of left-out logs [V], which the model states; by default it states those of the fit.
-    rows : sequence of FitRows
-        Rows of `held_out_v`.
-    """
-    # The square root of the precision, and the names of its columns.
-    root = np.linalg.cholesky(np.linalg.inv(solution.covariance)).T
-    names = [f"knot_{soc:g}" for soc in KNOTS_PCT.tolist()]
-    names += ["kt", *(f"R{k}" for k in range(1, P - N - 1)), "b"]
-    names += [f"amplitude_{k}" for k in range(1, solution.coefficients.size - P + 1)]
-    information = Information(
-        columns=names,
-        root=np.triu(root).tolist(),
-        projected=(root @ solution.coefficients).tolist(),
-    )
-    judged = _stated_error(held_out_v, rows, solution.residual_v, solution.mean_v)
-    return Model.of_knots(solution, judged, information=information, **fields)
-
-
-def _fit_published(
-    rows: Sequence[FitRows], equation: PublishedEquation, fields: dict[str, Any]
-) -> _Fitted:
-    roots = [equation.root(item) for item in rows]
-    published = equation.fit(rows, roots)
-    if not published.identified:
-        raise InputError(
-            "the logs do not identify the published equation: too little SoC, too few rows, or a"
-            " pseudo-OCV that falls with SoC",
-            field="equation",
-            value="published",
-            cure="leave out --equation published, or give logs over more SoC",
-        )
-    errors_v = []
-    for number, item in enumerate(rows if len(rows) >= LOGS_AT_LEAST else ()):
-        others = [place for place in range(len(rows)) if place != number]
-        without = equation.fit([rows[k] for k in others], [roots[k] for k in others])
-        errors_v.append(item.voltage_v - item.product(equation.columns, without.coefficients))
-    errors = _comparable(rows, errors_v)
-    mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
-    judged = _stated_error(errors, rows, published.residual_v, mean_v)
-    jacobian, found = published.jacobian(), published.fields()
-    covariance = jacobian @ published.covariance @ jacobian.T
-    model = Model(
-        equation="published",
-        published=found,
-        functions=principal_functions(
-            fields["chemistry"], covariance, found.loads, fields["capacity_ah"]
-        ),
-        noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),
-        **fields,
-    )
-    return model, published, errors, None
-
-
-def _comparable(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-    """Return the errors of left-out logs [V], NaN at a SoC that no other log reaches.
-
-    Parameters
-    ----------
-    rows : sequence of FitRows
-    errors_v : sequence of array of shape (m,)
-        Error of each log by the model of the others [V]; empty for too few logs.
-    """
-    lows = [float(item.soc_pct.min()) for item in rows]
-    highs = [float(item.soc_pct.max()) for item in rows]
-    found = []
-    for number, error_v in enumerate(errors_v):
-        low = min(lows[:number] + lows[number + 1 :])
-        high = max(highs[:number] + highs[number + 1 :])
-        soc = rows[number].soc_pct
-        found.append(np.where((soc >= low) & (soc <= high), error_v, np.nan))
-    return tuple(found)
-
-
-def _stated_error(
-    held_out_error_v: Sequence[FloatArray],
-    rows: Sequence[FitRows],
-    residual_v: float,
-    mean_v: float,
-) -> dict[str, Any]:
-    """Return the error that a model file states: of left-out logs, or of the fit without any."""
-    judged = sum(int(np.isfinite(error_v).sum()) for error_v in held_out_error_v)
-    if not judged:
-        return {
-            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * residual_v / mean_v,
-            "voltage_rmse_v": residual_v,
-            "judged_on": "the rows of the fit itself (too few logs to leave one out)",
-        }
-    of_logs = list(zip(held_out_error_v, rows, strict=True))
-    relative = sum(float(np.nansum(np.abs(error) / item.voltage_v)) for error, item in of_logs)
-    square_v2 = sum(float(np.nansum(error_v**2)) for error_v in held_out_error_v)
-    return {
-        "voltage_mae_pct": 100.0 * relative / judged,
-        "voltage_rmse_v": (square_v2 / judged) ** 0.5,
-        "judged_on": "whole logs left out in turn",
-    }
 
 
 def ranges_of(rows: Sequence[FitRows]) -> Ranges:

@@ -10,15 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.least_squares import SECONDS_PER_DATUM
+from cangauge.identify.held_out import comparable, stated_error
+from cangauge.identify.least_squares import LOGS_AT_LEAST, SECONDS_PER_DATUM
 from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
 from cangauge.model.curve import BASIS_NAMES, EDGE, KNOTS_PCT, PublishedCurve, ocv_basis
-from cangauge.model.model_file import Published
+from cangauge.model.model_file import Model, Published
+from cangauge.model.noise import Noise
+from cangauge.model.prior import principal_functions
 from cangauge.model.voltage_model import DELAYS_S, REFERENCE_C
 
 SINGULAR = 1e-9
@@ -161,3 +165,53 @@ class PublishedFit:
         jacobian[: KNOTS_PCT.size, :n] = ocv_basis(inside, epsilon) + beyond * slope
         jacobian[KNOTS_PCT.size :, n:] = np.eye(p - n)
         return jacobian
+
+
+def fit_published(
+    rows: Sequence[FitRows], equation: PublishedEquation, fields: dict[str, Any]
+) -> tuple[Model, PublishedFit, tuple[FloatArray, ...]]:
+    """Fit the published equation; return model, fit and errors of left-out logs [V].
+
+    Parameters
+    ----------
+    rows : sequence of FitRows
+        Of each log.
+    equation : PublishedEquation
+    fields : dict
+        Fields of the model file that are known before the fit.
+
+    Raises
+    ------
+    InputError
+        If the logs do not identify it.
+    """
+    roots = [equation.root(item) for item in rows]
+    published = equation.fit(rows, roots)
+    if not published.identified:
+        raise InputError(
+            "the logs do not identify the published equation: too little SoC, too few rows, or a"
+            " pseudo-OCV that falls with SoC",
+            field="equation",
+            value="published",
+            cure="leave out --equation published, or give logs over more SoC",
+        )
+    errors_v = []
+    for number, item in enumerate(rows if len(rows) >= LOGS_AT_LEAST else ()):
+        others = [place for place in range(len(rows)) if place != number]
+        without = equation.fit([rows[k] for k in others], [roots[k] for k in others])
+        errors_v.append(item.voltage_v - item.product(equation.columns, without.coefficients))
+    errors = comparable(rows, errors_v)
+    mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
+    judged = stated_error(errors, rows, published.residual_v, mean_v)
+    jacobian, found = published.jacobian(), published.fields()
+    covariance = jacobian @ published.covariance @ jacobian.T
+    model = Model(
+        equation="published",
+        published=found,
+        functions=principal_functions(
+            fields["chemistry"], covariance, found.loads, fields["capacity_ah"]
+        ),
+        noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),
+        **fields,
+    )
+    return model, published, errors
