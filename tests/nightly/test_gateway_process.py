@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 
@@ -23,8 +24,11 @@ from whole_processes import (
     YEAR_S,
     Life,
     Traffic,
+    as_root,
     clean,
     errors,
+    full_disk,
+    saved_s,
     write_state,
 )
 
@@ -131,3 +135,30 @@ def test_gateway(fault: str, tmp_path: Path) -> None:
                 assert clean(life.text), life.text
         assert max(battery.late_s) < DOUBT_S + 0.3
     assert ended > 0 or fault != "memory"
+
+
+@as_root
+def test_gateway_hands_on_with_its_disk_full(tmp_path: Path) -> None:
+    random = Random("disk")  # noqa: S311 - repeatable
+    with Battery() as battery:
+        for seed in range(SEEDS):
+            folder = tmp_path / str(seed)
+            with full_disk(folder, random.randrange(80, 900)) as mend:
+                write_state(folder / "cangauge-state.json", battery.address, seed)
+                begun = len(battery.soc_pct)
+                with gateway(battery, folder) as life:
+                    # Filled while it starts, or while it runs.
+                    time.sleep(random.uniform(0.0, 4.0))
+                    with suppress(OSError), (folder / "other").open("wb", buffering=0) as other:
+                        while True:
+                            other.write(bytes(4096))
+                    assert waits(lambda: "free some space" in life.text, 60.0), life.text
+                    before_s = saved_s(folder)
+                    assert before_s > 0.0
+                    assert waits(lambda: {OWN_PCT} < set(battery.soc_pct[begun:]), 60.0)  # noqa: B023
+                    battery.wait(20)
+                    mend()
+                    assert waits(lambda: saved_s(folder) > before_s, 60.0), life.text  # noqa: B023
+                    assert life.end() == 0
+                    assert clean(life.text), life.text
+        assert max(battery.late_s) < DOUBT_S + 0.3

@@ -27,8 +27,11 @@ from whole_processes import (
     YEAR_S,
     Life,
     Traffic,
+    as_root,
     clean,
     errors,
+    full_disk,
+    saved_s,
     write_state,
 )
 
@@ -45,7 +48,6 @@ from cangauge.types import Sample, Status
 from live import waits
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and mounts of Linux")
-as_root = pytest.mark.skipif(os.geteuid() != 0, reason="root mounts")
 HOUR_S = 3600.0
 STOPPED_S = float(os.environ.get("STOPPED_S", "600"))
 """Time for which a process is stopped [s]; less for a trial."""
@@ -151,17 +153,6 @@ def test_kill(tmp_path: Path) -> None:
 
 
 @contextmanager
-def full_disk(folder: Path, size_kb: int) -> Iterator[Callable[[], object]]:
-    """Mount a small disk; yield what makes it large."""
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_kb}k", "x", folder], check=True)
-    try:
-        yield lambda: subprocess.run(["mount", "-o", "remount,size=20000k", folder], check=True)
-    finally:
-        subprocess.run(["umount", "-l", folder], check=True)
-
-
-@contextmanager
 def read_only(folder: Path) -> Iterator[Callable[[], object]]:
     """Forbid everybody to make, rename or remove files in a folder; yield what allows it again."""
     subprocess.run(["chattr", "+i", folder], check=True)
@@ -189,17 +180,12 @@ def test_disk(fault: str, tmp_path: Path) -> None:
             assert waits(lambda: words in life.text, 60.0), life.text  # noqa: B023
             battery.wait(20)  # it goes on
             check_saved(folder)
-            saved_s = _saved_s(folder)
+            before_s = saved_s(folder)
             mend()
-            assert waits(lambda: _saved_s(folder) > saved_s, 60.0), life.text  # noqa: B023
+            assert waits(lambda: saved_s(folder) > before_s, 60.0), life.text  # noqa: B023
             assert life.end() == 0
             check_saved(folder)
             assert clean(life.text), life.text
-
-
-def _saved_s(folder: Path) -> float:
-    state = folder / "cangauge-state.json"
-    return read_state(state).saved_s if state.exists() else 0.0
 
 
 @pytest.mark.parametrize("off_s", [0.0, -2.0 * YEAR_S, -HOUR_S, HOUR_S, 2.0 * YEAR_S])

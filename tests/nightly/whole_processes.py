@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
 import can
+import pytest
 
 from cangauge.bus.open import BusAddress
 from cangauge.bus.vehicle import Vehicle
@@ -18,11 +22,12 @@ from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.state import StateKeeper
+from cangauge.service.state import StateKeeper, read_state
 from cangauge.types import Status
 from live import COMMAND, PATIENCE_S, leaf_model, leaf_model_path, short_log
 
 SEEDS = 20
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="root mounts")
 YEAR_S = 365.0 * 86400.0
 VEHICLE, MODEL = Vehicle.load("generic"), leaf_model()
 DRIVE = list(samples_of(short_log(2000.0, 1.0)))
@@ -127,3 +132,20 @@ def write_state(path: Path, address: BusAddress, seed: int) -> None:
             pipeline.handle(frame)
     assert pipeline.latest.status == Status.VALID
     keeper.__exit__()
+
+
+@contextmanager
+def full_disk(folder: Path, size_kb: int) -> Iterator[Callable[[], object]]:
+    """Mount a small disk; yield what makes it large."""
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_kb}k", "x", folder], check=True)
+    try:
+        yield lambda: subprocess.run(["mount", "-o", "remount,size=20000k", folder], check=True)
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+def saved_s(folder: Path) -> float:
+    """Return when the state of a folder was saved, 0 if there is none."""
+    state = folder / "cangauge-state.json"
+    return read_state(state).saved_s if state.exists() else 0.0
