@@ -283,13 +283,22 @@ def test_a_stated_zone_tells_the_hours_that_a_clock_skips_or_repeats(
     assert log.time_s[0] == datetime(2024, month, day, 0, 57, tzinfo=UTC).timestamp()
 
 
-def test_without_a_zone_a_change_of_the_clock_is_said(tmp_path: Path) -> None:
-    head, cure = "Time,Current,Voltage,Temp", r"--columns 'time=Time\[Europe/Berlin\]'"
-    log = read(tmp_path, head, local_rows(3, 31))
-    said = f"skips an hour at row 181, .*{cure}"
-    assert any(re.search(said, remark) for remark in log.remarks)
-    with pytest.raises(InputError, match=f"goes back by an hour at row 181.*{cure}"):
-        read(tmp_path, head, local_rows(10, 27))
+@pytest.mark.parametrize("is_long", [False, True])
+def test_without_a_zone_a_change_of_the_clock_is_said(tmp_path: Path, *, is_long: bool) -> None:
+    def read_local(month: int, day: int) -> Log:
+        rows = local_rows(month, day)
+        if not is_long:
+            return read(tmp_path, "Time,Current,Voltage,Temp", rows)
+        series = (("current", 5), ("voltage", 360), ("temperature", 20))
+        times = [row.partition(",")[0] for row in rows]
+        values = [f"bms {name},{value},{time}" for time in times for name, value in series]
+        return read(tmp_path, "name,value,time", values)
+
+    cure = "UTC" if is_long else r"--columns 'time=Time\[Europe/Berlin\]'"
+    said = f"skips an hour after 2024-03-31 01:59:59: .*{cure}"
+    assert sum(bool(re.search(said, remark)) for remark in read_local(3, 31).remarks) == 1
+    with pytest.raises(InputError, match=f"repeats an hour after 2024-10-27 02:59:59; .*{cure}"):
+        read_local(10, 27)
 
 
 # ---- the choice of columns

@@ -55,6 +55,8 @@ _SPELLINGS: Final = (
     (r"^(\d+)\.(\d{2}:\d{2}:\d{2})", r"\1d \2"),
     (r"^(\d{3}):(\d{2}:\d{2}:\d{2})$", r"\1d \2"),
 )
+HOUR_S: Final = 3600.0
+"""Change of a local clock at daylight saving time [s]."""
 _MONTHS: Final = "jan feb mar apr may jun jul aug sep oct nov dec"
 _GERMAN: Final = {"mrz": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 _ORDERS: Final = ("ymd", "dmy", "mdy")
@@ -262,6 +264,31 @@ def over_midnight(of_day_s: FloatArray) -> FloatArray:
     values, read = of_day_s.copy(), np.isfinite(of_day_s)
     values[read] += np.cumsum(np.diff(values[read], prepend=0.0) < -43200.0) * 86400.0
     return values
+
+
+def changes_of_clock(dates_s: FloatArray, source: str, label: str, cure: str) -> list[str]:
+    """Return remarks on dates without a zone that skip an hour, as at daylight saving time.
+
+    Raises
+    ------
+    InputError
+        If they go back by an hour.
+    """
+    known_s = dates_s[np.isfinite(dates_s)]
+    if known_s.size < 2:
+        return []
+    if np.median(np.diff(known_s)) < 0.0:  # the newest first
+        known_s = known_s[::-1]
+    step = np.diff(known_s)
+    usual_s = float(np.median(step))
+    remarks = []
+    for row in np.flatnonzero(np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s):
+        date = np.datetime64(int(known_s[row]), "s").item()
+        problem = f"as at daylight saving time, the clock {{}} an hour after {date}"
+        if step[row] < 0.0:
+            raise InputError(problem.format("repeats"), source=source, field=label, cure=cure)
+        remarks.append(f"{problem.format('skips')}: if no hour is missing there, {cure}")
+    return remarks
 
 
 def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str]:

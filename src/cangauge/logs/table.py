@@ -9,7 +9,7 @@ only those that changed.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
@@ -40,7 +40,7 @@ from cangauge.logs.quantities import (
     known_temperature_source,
     unit_of,
 )
-from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
+from cangauge.logs.stamps import changes_of_clock, is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
 from cangauge.logs.values import first_text, is_number, numbers_of, read_cells
 
@@ -49,8 +49,6 @@ MAX_COUNTERS: Final = 6
 HOLD_S: Final = 1.0
 """Longest time over which a voltage is held or interpolated to a row with a current [s], where each
 channel has times of its own: a bus repeats both within it."""
-HOUR_S: Final = 3600.0
-"""Change of a local clock at daylight saving time [s]."""
 _STATES: Final = re.compile(
     r"(?<![a-z])(?:state|status|md|mode|direction|dir|type|step|command|(?:dis)?charg(?:e|ing))"
     "(?![a-z])|状态|类型"
@@ -82,14 +80,14 @@ class ArrowTable:
     units: Sequence[str] = ()
     remarks: list[str] = field(default_factory=list)
 
-    def columns(self, places: Sequence[int]) -> dict[int, Any]:
+    def columns(self, places: Sequence[int], apart: Collection[int] = ()) -> dict[int, Any]:
         """Return columns by place; raise InputError if another column has one of their names."""
         names = [self.headings[place] for place in places]
         for name in names:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
-        return read_cells(columns, self.headings, self.source)
+        return read_cells(columns, self.headings, self.source, apart=apart)
 
 
 def draft_of_table(
@@ -115,7 +113,8 @@ def draft_of_table(
     beside = {k: k + 1 for k in wanted if _UNITS.search("".join(headings[k + 1 : k + 2]))}
     wanted += beside.values()
     counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, wanted)
-    cells = table.columns([*dict.fromkeys([*wanted, *counters])])
+    times = [*chosen["time"].places, *(place for place, _ in chosen["time"].others)]
+    cells = table.columns([*dict.fromkeys([*wanted, *counters])], apart=times)
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     units = {place: _only_word(cells[k], where, headings[k]) for place, k in beside.items()}
     for quantity, column in chosen.items():
@@ -299,27 +298,16 @@ def _take_time(
         cure = "name another one: --columns time=…"
         raise draft.error(name, "this column does not move: it is no time", cure, float(known_s[0]))
     if "without zone" in how:
-        _refuse_clock_change(draft, time_s)
+        cure = f"state the zone of its dates, such as --columns 'time={draft.labels[name]}"
+        draft.remarks += changes_of_clock(
+            time_s, where, draft.labels[name], f"{cure}[Europe/Berlin]'"
+        )
     draft.values[name] = time_s
     if how == "s, assumed":
         draft.in_seconds = False if column.is_stated else None
     elif unit_of(name, how) is None:  # dates, clock times, ticks since a date
         draft.in_seconds = True
     return column, how
-
-
-def _refuse_clock_change(draft: DraftLog, time_s: FloatArray) -> None:
-    """Raise InputError where dates go back by an hour; remark where they skip one."""
-    step = np.diff(time_s[np.isfinite(time_s)])
-    usual_s = float(np.median(step)) if step.size else 0.0
-    label = draft.labels["time_s"]
-    cure = f"state the zone of its dates, such as --columns 'time={label}[Europe/Berlin]'"
-    for row in np.flatnonzero(np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s):
-        change = "goes back by" if step[row] < 0.0 else "skips"
-        problem = f"the clock {change} an hour at row {row + 2}, as at daylight saving time"
-        if step[row] < 0.0:
-            raise draft.error("time_s", problem, cure)
-        draft.remarks.append(f"{problem}: if no hour is missing there, {cure}")
 
 
 def _label(draft: DraftLog, name: str, column: ChosenColumn, joint: str) -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
 from itertools import product, repeat
 from typing import Any, Final, NamedTuple
 
@@ -51,7 +50,7 @@ class TextTable(NamedTuple):
     word: str = ""
 
     def columns(self, places: Sequence[int], apart: Collection[int] = ()) -> dict[int, Any]:
-        """Read columns, as `read_cells`; the marks in those `apart` tell nothing of the others.
+        """Read columns, as `read_cells`.
 
         A cut last line and closing remarks of the exporter are left out, with a remark.
 
@@ -86,7 +85,7 @@ class TextTable(NamedTuple):
         types = {names[place]: pa.string() for place in places}
         try:
             beginning = parsed(data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1] or data, types)
-            numbers = numbers_in(beginning)
+            numbers = numbers_in(beginning, [names[place] for place in apart])
             try:
                 table = parsed(data, types | numbers)
                 is_refuted = bool(numbers) and has_spelled_numbers(table.columns)
@@ -105,17 +104,8 @@ class TextTable(NamedTuple):
             doubt = "if the file was cut off, its last value may be short"
             self.remarks.append(f"the last line has no line end: {doubt}")
         headings = [*self.headings, *repeat("", width)]
-        parts = [[place for place in places if (place in apart) is each] for each in (False, True)]
-        read = (
-            read_cells(
-                {place: table.column(names[place]) for place in part},
-                headings,
-                str(self.head.path),
-                self.head.decimal_mark,
-            )
-            for part in parts
-        )
-        return {place: cells for part in read for place, cells in part.items()}
+        columns = {place: table.column(names[place]) for place in places}
+        return read_cells(columns, headings, str(self.head.path), self.head.decimal_mark, apart)
 
     def _width(self, places: Sequence[int]) -> int:
         """Return the number of cells of the first row, which may be another than the header's."""
@@ -175,13 +165,15 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     canonical = None
     headers = ((table, rows) for rows in (1, 2) for table in headed(head, rows))
     for table, rows in headers:
-        with suppress(InputError):  # no column has a heading that the user names
+        try:
             choice = choose_columns(table.headings, (), given)
-            if choice.is_complete:
-                units = _units_above(table, table.skip_lines - rows, choice)
-                return _above_data(table._replace(units=units), choice, given)
-            if choice.is_canonical and canonical is None:
-                canonical = _above_data(table, choice, given)
+        except InputError:  # no column has a heading that the user names
+            continue
+        if choice.is_complete:
+            units = _units_above(table, table.skip_lines - rows, choice)
+            return _above_data(table._replace(units=units), choice, given)
+        if choice.is_canonical and canonical is None:
+            canonical = _above_data(table, choice, given)
     return canonical
 
 
@@ -219,17 +211,28 @@ def _above_data(table: TextTable, choice: Choice, given: ColumnMap | None) -> Te
 
 
 def _units_above(table: TextTable, header: int, choice: Choice) -> list[str]:
-    """Return the row above the header if it holds a unit of every quantity; [] if not."""
+    """Return the row above the header if it holds a unit of every quantity; [] if not.
+
+    Raises
+    ------
+    InputError
+        If it contradicts the names of the canonical log.
+    """
     above = next((line for line in table.head.lines[:header][::-1] if line.strip()), "")
     row = split_cells(above, table.delimiter)
     if len(row) != len(table.headings):
         return []
-    scales = (
+    scales = [
         unit_of(FIELDS[name], row[place].strip("()[]"))
         for name, column in choice.chosen.items()
         for place in column.places
-    )
-    return [] if choice.is_canonical or None in scales else row
+    ]
+    if None in scales:
+        return []
+    if choice.is_canonical and {*scales} != {(1.0, 0.0)}:
+        problem, cure = "the row of units above contradicts the headings", "correct one of them"
+        raise InputError(problem, source=table.head.path, value=above.strip()[:80], cure=cure)
+    return row
 
 
 def _repeats_units(row: Sequence[str], choice: Choice) -> bool:

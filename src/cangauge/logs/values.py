@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -66,12 +66,14 @@ def read_cells(
     headings: Sequence[str],
     source: str | None,
     decimal_mark: str = "",
+    apart: Collection[int] = (),
 ) -> dict[int, Any]:
     """Return columns of one table: text that holds numbers as these, other text trimmed.
 
     Null stands where there is no value, and where a restarted logger wrote its header again.
     Numbers are read as they are spelled (`−1'800,5 V`): what a mark means in one cell tells it in
-    all others of the table. `decimal_mark` is that of a table of which no cell does.
+    all others of the table, but one in the columns `apart`, of times, not in the others: programs
+    write times as they do themselves. `decimal_mark` is that of a table of which no cell tells it.
 
     Raises
     ------
@@ -80,11 +82,11 @@ def read_cells(
     """
     texts = {place: each.cast(pa.string()) for place, each in columns.items() if is_text(each)}
     present = {place: _present(cells, headings[place]) for place, cells in texts.items()}
-    read = _with_decimal_points(present, headings, source, decimal_mark)
+    read = _with_decimal_points(present, headings, source, decimal_mark, apart)
     return {**columns, **{place: _as_numbers(cells) for place, cells in read.items()}}
 
 
-def numbers_in(beginning: Any) -> dict[str, Any]:
+def numbers_in(beginning: Any, apart: Collection[str] = ()) -> dict[str, Any]:
     """Return the types of columns of numbers by the beginning of a table.
 
     They are then parsed without the text, which would take twice the memory of a long log. A later
@@ -95,7 +97,7 @@ def numbers_in(beginning: Any) -> dict[str, Any]:
     bare = [name for name, cells in columns.items() if not is_text(_as_numbers(cells))]
     if has_spelled_numbers([columns[name] for name in columns.keys() - bare]):
         return {}
-    if any(_odd(columns[name], _ONE_MARK, ".") for name in bare):
+    if any(_odd(columns[name], _ONE_MARK, ".") for name in bare if name not in apart):
         return dict.fromkeys(bare, pa.float64())
     has_points = any(_any(columns[name], "[.]") for name in bare)
     return {} if has_points else dict.fromkeys(bare, pa.int64())
@@ -140,14 +142,18 @@ def _numbers_among(cells: Any) -> Any:
 
 
 def _with_decimal_points(
-    texts: Mapping[int, Any], headings: Sequence[str], source: str | None, decimal_mark: str
+    texts: Mapping[int, Any],
+    headings: Sequence[str],
+    source: str | None,
+    decimal_mark: str,
+    apart: Collection[int],
 ) -> dict[int, Any]:
     """Return columns of text, their numbers with `-` as minus and `.` as the only mark."""
     alike = {place: _spelled_alike(cells) for place, cells in texts.items()}
     numbers = {place: _numbers_among(cells) for place, cells in alike.items()}
     numbers = {place: cells for place, cells in numbers.items() if _any(cells, "[.,]")}
     own = {place: _decimal_marks(cells) for place, cells in numbers.items()}
-    of_table = set[str]().union(*own.values())
+    of_table = set[str]().union(*(marks for place, marks in own.items() if place not in apart))
     of_table = of_table or {*decimal_mark}
     for place, cells in numbers.items():
         decimal = own[place] if len(own[place]) == 1 else of_table

@@ -21,7 +21,7 @@ from cangauge.logs.draft import DraftLog
 from cangauge.logs.gaps import BRIDGE_S, usual_step_s
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.read import LogTableReader
-from cangauge.logs.stamps import over_midnight, seconds_of
+from cangauge.logs.stamps import changes_of_clock, over_midnight, seconds_of
 from cangauge.logs.text import MAX_ROWS, TextTable, headed
 from cangauge.logs.values import is_text
 
@@ -187,11 +187,17 @@ class LongTable(Channels):
         names = pc.replace_substring(names, " []", "")
         names = names.combine_chunks().dictionary_encode()
         names_of = " and ".join(text.headings[place] for place in varying)
+        changes = list[str]()
+        for code in range(len(names.dictionary)) if "without zone" in how else ():
+            own_s = stamps_s[names.indices.to_numpy() == code]
+            changes += changes_of_clock(own_s, source, label, "export the times in UTC")
         series = _by_name(names, stamps_s, values)
         if not series:
             problem, label = "no value is a number", text.headings[value]
             raise InputError(problem, source=source, field=label, cure="check the export")
-        return cls(names_of, label, how, series)
+        table = cls(names_of, label, how, series)
+        table.remarks += changes[:1]
+        return table
 
     @property
     def headings(self) -> list[str]:
