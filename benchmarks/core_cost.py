@@ -232,7 +232,7 @@ def main() -> None:
     tables = []
     if shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm"):
         tables.append(target_table())
-    steps = Table("rate [Hz]", "step", "µs", title="Processor time of a step")
+    steps = Table("rate [Hz]", "implementation", "µs", title="Processor time of a step")
     for row in step_costs():
         steps.add_row(f"{row['rate_hz']:g}", row["way"], f"{row['us']:.2f}")
     tables.append(steps)

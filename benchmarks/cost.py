@@ -221,7 +221,7 @@ def fits() -> Result:
             ):
                 paths.append(str(Path(folder, f"{log.name}.{suffix}")))
                 write_log(log, paths[-1])
-            name = f"{suffix}, {rows:,} rows in {len(paths)} logs"
+            name = f"{suffix}, {rows:,} rows in {len(paths)} {'log' if whole else 'logs'}"
             found[name] = _fit(paths, Path(folder, "model.json"))
             sys.stderr.write(f"{name}: {found[name]}\n")
             for path in paths:
@@ -319,9 +319,9 @@ PARTS: dict[str, Callable[[], Result]] = {
 
 WORDS = {
     "": "{} s",
-    "ratio": "{} × its barest form",
+    "ratio": "{} × baseline",
     "us": "{} µs",
-    "bare_us": "barest {} µs",
+    "bare_us": "baseline {} µs",
     "seconds": "{} s",
     "peak_mib": "{} MiB",
 }

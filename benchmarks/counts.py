@@ -160,7 +160,7 @@ def main() -> int:
     else:
         sys.stderr.write("instructions are left out: valgrind is not installed\n")
     kept = json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
-    table = Table("count", "now", "kept")
+    table = Table("count", "now", "stored")
     for name, count in found.items():
         table.add_row(name, f"{count:,}", f"{kept[name]:,}" if name in kept else "–")
     if options.keep:

@@ -172,7 +172,15 @@ def table_of(found: Result) -> Table:
     """Return the table."""
     ours = found[OURS]["us"]
     table = Table()
-    for heading in ("", "µs, 10 Hz", "ratio", "µs, 1 Hz", "ratio", "MAE i3 %", "MAE car1 %"):
+    for heading in (
+        "",
+        "10 Hz [µs]",
+        "ratio, 10 Hz",
+        "1 Hz [µs]",
+        "ratio, 1 Hz",
+        "MAE i3 [%]",
+        "MAE car1 [%]",
+    ):
         table.add_column(heading, justify="right" if heading else "left")
     for name, row in found.items():
         cells = []

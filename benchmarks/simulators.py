@@ -227,11 +227,11 @@ def main() -> None:
     table = Table(
         "simulator",
         "fault",
-        "stated",
-        "most probable",
+        "stated faults",
+        "most probable fault",
         "P(truth)",
-        "simulated RMSE",
-        "corrected",
+        "RMSE of the simulator",
+        "RMSE after correction",
     )
     for row in rows(options.data):
         table.add_row(*row)

@@ -182,20 +182,23 @@ def main() -> int:
             rows.append((attack, max(gaps), resident_mb(process.pid)))
 
         measured("none")
-        for number, text in ((signal.SIGKILL, "killed"), (signal.SIGSTOP, "stopped")):
+        for number, text in (
+            (signal.SIGKILL, "HTTP and MQTT program killed"),
+            (signal.SIGSTOP, "HTTP and MQTT program stopped"),
+        ):
             with live(folder) as served:
                 served.send_signal(number)
                 measured(text)
         with live(folder):
             for attack, text in (
-                (never_released, "QoS 2, never released"),
-                (one_large, "a message of 200 MB"),
+                (never_released, "broker never releases QoS 2 messages"),
+                (one_large, "broker sends a message of 200 MB"),
             ):
                 broker.attack = attack
                 measured(text)
                 broker.attack = None
             with viewers(600):
-                measured("600 viewers")
+                measured("600 clients that read nothing")
         measured("none")
     before = rows[0][2]
     table = Table("attack", "longest interval of SOC_ESTIMATE [s]", "estimator's memory [MB]")

@@ -46,7 +46,7 @@ def cases(
     """Return what is wrong, with the model and the log that the estimator gets."""
     small = model.model_copy(update={"capacity_ah": 0.6 * model.capacity_ah})
     found = [
-        ("nothing", model, log),
+        ("none", model, log),
         ("another pack's model", other, log),
         ("capacity −40 %", small, log),
         ("current +10 %", model, replace(log, current_a=1.1 * log.current_a)),
@@ -92,8 +92,17 @@ def main() -> None:
                 for what, its_model, seen in cases(model, other, log, colder):
                     for start, words in (("auto", "withheld"), (float(seen.soc_pct[0]), "given")):
                         rows[name, what, words].append(figures(seen, its_model, start))
-    heads = ("pack", "wrong", "start", "drives", "VALID", "VALID and > 3σ", "of VALID in 2σ",
-             "ever INVALID", "after, median")  # fmt: skip
+    heads = (
+        "pack",
+        "error",
+        "initial SoC",
+        "drives",
+        "time VALID",
+        "time VALID and off by > 3σ",
+        "VALID estimates within 2σ",
+        "drives with INVALID",
+        "first INVALID after (median)",
+    )
     table = Table(*heads)
     for (name, what, start), found in rows.items():
         mean = {key: np.nanmean([each[key] for each in found]) for key in ("valid", "wrong")}

@@ -89,7 +89,7 @@ def share(values: Sequence[bool]) -> str:
 def summary(lines: Sequence[dict]) -> Table:
     """Return what is found, with a model of the pack and without."""
     table = Table(box=box.SIMPLE)
-    for head in ("", "with a model", "without"):
+    for head in ("", "with a model", "without a model"):
         table.add_column(head)
     both = [[line for line in lines if line["model"] == of] for of in (True, False)]
     rows = [numbers(some) for some in both]
@@ -110,17 +110,17 @@ def numbers(lines: Sequence[dict]) -> dict[str, str]:
     cpu_s = [line["cpu_s"] for line in lines]
     return {
         "Alarms on healthy chains": share([is_verdict(line, "off") for line in healthy]),
-        '"off" where the error is below 3 %': share([is_verdict(line, "off") for line in small]),
-        '"agrees" where it is above 5 %': share([is_verdict(line, "agrees") for line in large]),
-        '"off" where it is above 5 %': share([is_verdict(line, "off") for line in large]),
-        "Error within 2σ": share([is_within(line) for line in lines]),
-        "A cause named, of faulty gauges": share([bool(line["faults"]) for line in faulty]),
-        "All faults named and no other, of those named": share([is_right(line) for line in named]),
-        "Size of a weak cell inside its interval": share([is_inside(line) for line in weak]),
-        "Moment of a self-reset within ten minutes": share(
+        'Wrong "off" (error below 3 %)': share([is_verdict(line, "off") for line in small]),
+        'Wrong "agrees" (error above 5 %)': share([is_verdict(line, "agrees") for line in large]),
+        'Right "off" (error above 5 %)': share([is_verdict(line, "off") for line in large]),
+        "Stated error within 2σ of the true error": share([is_within(line) for line in lines]),
+        "Faulty gauges with a named cause": share([bool(line["faults"]) for line in faulty]),
+        "Named causes that are right and complete": share([is_right(line) for line in named]),
+        "Interval contains the size of the weak cell": share([is_inside(line) for line in weak]),
+        "Time of a self-reset right within ten minutes": share(
             [line["reset_off_s"][0] <= 600.0 for line in resets]
         ),
-        "CPU of a chain: mean, most": f"{np.mean(cpu_s):.1f} s, {max(cpu_s):.1f} s",
+        "CPU time per chain: mean, maximum": f"{np.mean(cpu_s):.1f} s, {max(cpu_s):.1f} s",
     }
 
 

@@ -125,17 +125,24 @@ def tables(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> li
         for k in packs
     ]
     by_group = Table(
-        "faults", "cases", "right first", "in two", "one stated", "right", "gap", "gap or likely"
+        "group of cases",
+        "cases",
+        "right fault first",
+        "right fault in first two",
+        "one fault stated",
+        "stated fault right",
+        "gap reported",
+        "gap or likely gap",
     )
     for label, inside in groups:
         by_group.add_row(label, *_scores([(x, p) for x, p in known if inside(x)]))
     whole = Table("measure", "value")
     healthy = [p.level for x, p in rows if x.truth["fault"] == NONE]
-    whole.add_row("healthy: gap", f"{healthy.count('gap')} of {len(healthy)}")
-    whole.add_row("healthy: likely", f"{healthy.count('likely')} of {len(healthy)}")
-    whole.add_row("P(fault) → frequency (cases)", _calibration(rows))
+    whole.add_row("healthy logs with a gap", f"{healthy.count('gap')} of {len(healthy)}")
+    whole.add_row("healthy logs with a likely gap", f"{healthy.count('likely')} of {len(healthy)}")
+    whole.add_row("P(first fault) → share right (cases)", _calibration(rows))
     alike = [x.truth["fault"] in ALIKE[p.alike] for x, p in rows if p.alike is not None]
-    whole.add_row("what is off, beside two faults: right", f"{sum(alike)} of {len(alike)}")
+    whole.add_row("group of faults that look alike: right", f"{sum(alike)} of {len(alike)}")
     for measure, value in _corrections(rows):
         whole.add_row(measure, value)
     return [by_group, whole]
@@ -189,8 +196,11 @@ def _corrections(rows: Sequence[tuple[Example, Posterior]]) -> list[tuple[str, s
     covers = [x.found["covers"] for x, _ in rows if x.found["covers"] is not None]
     worse = sum(not x.found["better"] for x in offered)
     return [
-        ("correction offered, of gap or likely", f"{len(offered)} of {len(told)}"),
-        ("squared gap that it closes (median)", f"{np.median(closed):.2f}"),
-        ("corrections that are worse", str(worse)),
-        ("95 % intervals that hold the size", f"{np.mean(covers):.2f} of {len(covers)}"),
+        ("correction offered for a gap or likely gap", f"{len(offered)} of {len(told)}"),
+        ("squared gap closed by the correction (median)", f"{np.median(closed):.2f}"),
+        ("corrections that increase the error", str(worse)),
+        (
+            "95 % intervals that contain the injected size",
+            f"{np.mean(covers):.2f} of {len(covers)}",
+        ),
     ]

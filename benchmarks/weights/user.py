@@ -41,17 +41,19 @@ def _less_capacity(log: Log, model: Model) -> Log:
 
 
 CELLS: dict[str, tuple[str, Callable[[Log, Model], Log]]] = {
-    "× 1.02 V": ("voltage_reading", lambda x, _: replace(x, voltage_v=1.02 * x.voltage_v)),
-    "+ 3 V": ("voltage_reading", lambda x, _: replace(x, voltage_v=x.voltage_v + 3.0)),
-    "+ 3 A": ("current_reading", lambda x, _: replace(x, current_a=x.current_a + 3.0)),
+    "voltage × 1.02": ("voltage_reading", lambda x, _: replace(x, voltage_v=1.02 * x.voltage_v)),
+    "voltage + 3 V": ("voltage_reading", lambda x, _: replace(x, voltage_v=x.voltage_v + 3.0)),
+    "current + 3 A": ("current_reading", lambda x, _: replace(x, current_a=x.current_a + 3.0)),
     "current × 1.05": ("current_reading", lambda x, _: replace(x, current_a=1.05 * x.current_a)),
-    "+ 8 K": ("temperature", lambda x, _: replace(x, temperature_c=x.temperature_c + 8.0)),
-    "0.5 s late": ("clock", lambda x, _: _late(x)),
-    "+ 0.03 Ω · I": (
+    "temperature + 8 K": (
+        "temperature", lambda x, _: replace(x, temperature_c=x.temperature_c + 8.0),
+    ),
+    "current 0.5 s late": ("clock", lambda x, _: _late(x)),
+    "resistance + 0.03 Ω": (
         "resistance", lambda x, _: replace(x, voltage_v=x.voltage_v - 0.03 * x.current_a),
     ),
     "capacity − 8 %": ("capacity", _less_capacity),
-    "start 12 % wrong": ("start", lambda x, _: _started(x, 12.0)),
+    "initial SoC + 12 %": ("start", lambda x, _: _started(x, 12.0)),
 }  # fmt: skip
 """What is done to both trips → the fault."""
 
@@ -71,7 +73,7 @@ def trips(data: Path) -> Table:
         for name, (_, change) in CELLS.items():
             logs = [change(_trip(data, number), model) for number in LOGS]
             columns[name, count] = diagnose(logs, model, healthy)
-    table = Table("done to both trips", "6 references", "12 references")
+    table = Table("injected into both trips", "6 references", "12 references")
     for name, (fault, _) in CELLS.items():
         table.add_row(name, *(_said(columns[name, count], fault) for count in (6, 12)))
     return table
@@ -102,8 +104,8 @@ def _wrong_models(model: Model) -> dict[str, Model]:
     return {
         "as fitted": model,
         "resistances × 3": model.model_copy(update=three_times),
-        "+ 8 V": model.model_copy(update=eight_volts),
-        "resistances × 3, + 8 V": model.model_copy(update=three_times | eight_volts),
+        "curve + 8 V": model.model_copy(update=eight_volts),
+        "resistances × 3, curve + 8 V": model.model_copy(update=three_times | eight_volts),
         "without R(T)": model.model_copy(
             update={"loads": loads.model_copy(update={"arrhenius": flat})}),
         "capacity × 1.25": model.model_copy(update={"capacity_ah": 1.25 * model.capacity_ah}),
@@ -112,7 +114,9 @@ def _wrong_models(model: Model) -> dict[str, Model]:
 
 def models(data: Path) -> Table:
     """Return what is said of wrong models beside healthy logs of three packs."""
-    table = Table("pack", "model", "error [V]", "among themselves [V]", "corrected [V]", "missed")
+    table = Table(
+        "pack", "model", "error [V]", "expected error [V]", "corrected error [V]", "found"
+    )
     recorded = {x.name: x for part in packs.PARTS for x in packs.recorded(data, part)}
     for name in ("i3", "car1", "lg_cold"):
         pack = recorded[name]
@@ -123,7 +127,9 @@ def models(data: Path) -> Table:
             missed = "; ".join(
                 f"{each.evidence.shape.effect.id} "
                 + ", ".join(
-                    f"{v.value:.3g} {v.unit}" for v in each.evidence.parameters.values() if v.ci
+                    f"{v.value:.3g} {v.unit}".removesuffix(" 1")
+                    for v in each.evidence.parameters.values()
+                    if v.ci
                 )
                 for each in check.missed
             )
