@@ -22,7 +22,7 @@ from days import (
 from cangauge.diagnosis import FAULTS as NINE
 from cangauge.diagnosis import Diagnosis, Healthy, Posterior, diagnose
 from cangauge.diagnosis.model_check import ModelCheck
-from cangauge.diagnosis.text import sentence
+from cangauge.diagnosis.text import plan_text, sentence
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -144,11 +144,11 @@ def test_the_surer_the_answer_the_step_stays(known: Healthy, model: Model) -> No
 
 def test_where_is_an_excess(known: Healthy, model: Model) -> None:
     everywhere = diagnose([more_volts(day(20), 6.0)], model, known)
-    assert "Everywhere alike" in everywhere.summary
+    assert "The error is alike everywhere" in everywhere.summary
     late = day(20)
     half = late.time_s > 0.6 * late.duration_s
     found = diagnose([replace(late, voltage_v=late.voltage_v + 8.0 * half)], model, known)
-    assert "Everywhere alike" not in found.summary
+    assert "alike everywhere" not in found.summary
     for place in found.where:
         assert place["ci"][0] <= place["excess"] * 1.2
         assert place["axis"] in {"soc", "temperature", "current", "rest", "time"}
@@ -177,7 +177,7 @@ def test_a_model_with_a_wrong_level_is_told_first(references: list[Log], model: 
     assert found.model_check is not None
     assert [each.evidence.fault for each in found.model_check.missed] == ["voltage_reading"]
     assert found.is_written
-    assert "to it they look as if the pack voltage reads" in found.summary
+    assert "compared with the model, the pack voltage reads" in found.summary
     assert "with the model corrected" in found.summary
     assert found.extended_rmse_v < 0.3 * found.baseline_rmse_v
     assert judged(found, initial_soc=1.0).why_not is None
@@ -285,7 +285,8 @@ def test_a_correction_that_makes_the_soc_worse_is_refused(known: Healthy, model:
     )
     assert kept.is_written
     assert not refused.is_written
-    assert refused.why_not == "the SoC error of these logs would grow with it"
+    assert refused.why_not is not None
+    assert "the SoC error of left-out rows grows (" in refused.why_not
     assert refused.why_not in refused.summary
 
 
@@ -345,17 +346,39 @@ def test_faults_that_look_alike_are_told_together(faulty: Diagnosis) -> None:
     assert "level of the voltage" not in alone
 
 
+def test_the_measurement_of_the_second_fault_says_what_it_tells(faulty: Diagnosis) -> None:
+    measured = [
+        judged(faulty, **{a: 0.5, b: 0.45, "capacity": 0.05})
+        for a in ("time_skew", "weak_cell", "hysteresis", "voltage_offset")
+        for b in ("time_skew", "weak_cell", "hysteresis", "voltage_offset")
+        if a != b
+    ]
+    for found in measured:
+        assert found.next_step is not None
+        is_first = found.next_step[0] == found.posterior.stated[0]
+        assert found.check_first.startswith("To tell the ") is not is_first
+    assert {found.check_first.startswith("To tell the ") for found in measured} == {True, False}
+
+
+def test_a_step_in_one_of_several_logs_names_the_log(known: Healthy, model: Model) -> None:
+    logs = [day(20), resistance_step(day(21), 0.16), more_resistance(day(22), 0.16)]
+    found = judged(diagnose(logs, model, known), resistance_step=1.0)
+    assert " of day 21 (" in found.summary or "in minute 24 of day 21." in found.summary
+
+
 def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:
     leaning = judged(healthy, none=0.3, resistance_growth=0.7)
     assert leaning.posterior.level == "none"
     assert "P(no fault) 30 %, resistance 70 %." in leaning.summary
+    assert "a fault is likelier than none" in leaning.summary
     assert "Nothing to do" not in leaning.summary
+    assert plan_text(leaning).endswith("diagnose one more log like these together with them.")
     assert "Nothing to do" in judged(healthy, none=0.7, resistance_growth=0.3).summary
 
 
 def test_a_sentence_has_the_sign_of_its_unit(healthy: Diagnosis) -> None:
     for of in healthy.evidence.values():
-        said = sentence(healthy, of, healthy.healthy.model.pack)
+        said = sentence(of, healthy.healthy.model.pack, [rows.trace for rows in healthy.rows])
         assert "ohm" not in said
         assert " 1 (" not in said
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.diagnosis.where import Errors, clause, closed_part, excesses
+from cangauge.diagnosis.where import Errors, closed_part, excesses, where_sentence
 
 
 def errors_v(rows: int, wrong: int) -> Errors:
@@ -43,11 +43,11 @@ def test_a_drawn_piece_without_rows_costs_the_closed_part_nothing() -> None:
 @pytest.mark.parametrize(
     ("where", "words"),
     [
-        ("low SoC", "below 25 % SoC"),
-        ("cold", "below 15 °C"),
-        ("charging", "while charging at 1 to 20 A"),
-        ("after a rest", "in the first 10 min after a rest"),
-        ("nowhere", "everywhere alike"),
+        ("low SoC", "Below 25 % SoC"),
+        ("cold", "Below 15 °C"),
+        ("charging", "While charging at 1 to 20 A"),
+        ("after a rest", "In the first 10 min after a rest"),
+        ("nowhere", "The error is alike everywhere"),
     ],
 )
 def test_where_the_error_is_larger_is_said_in_words(where: str, words: str) -> None:
@@ -70,4 +70,4 @@ def test_where_the_error_is_larger_is_said_in_words(where: str, words: str) -> N
     before_v = np.where(wrong, 4.0, 1.0) * rng.normal(size=time_s.size)
     log = np.zeros(time_s.size, dtype=np.intp)
     errors = Errors(log, time_s, current_a, celsius, soc_pct, before_v, before_v)
-    assert clause(excesses(errors, 60.0)).startswith(words)
+    assert where_sentence(excesses(errors, 60.0)).startswith(words)

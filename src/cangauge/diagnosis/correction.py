@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -59,6 +60,14 @@ def soc_errors_pct(model: Model, log: LogRows) -> FloatArray:
     error_pct = np.abs(table.soc_pct - np.interp(of.time_s, of.time_s[known], own_pct[known]))
     is_settled = of.time_s - of.time_s[0] >= SETTLING_S
     return np.asarray(np.where(is_settled, error_pct, np.nan)[at])
+
+
+def mean_errors(before: FloatArray, after: FloatArray) -> tuple[float, float]:
+    """Return the means of two errors on the rows where both are known; NaN where none is."""
+    known = np.isfinite(before) & np.isfinite(after)
+    if not known.any():
+        return math.nan, math.nan
+    return float(before[known].mean()), float(after[known].mean())
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ from cangauge.diagnosis.correction import (
     Correction,
     HeldOut,
     errors_of,
+    mean_errors,
     model_file,
     soc_errors_pct,
 )
@@ -130,15 +132,7 @@ class Diagnosis:
     @cached_property
     def why_not(self) -> str | None:
         """Why there is no correction to write; None where there is one."""
-        if self.is_written:
-            return None
-        if self.correction is not None:
-            return "a wrong start belongs to these logs and not to the model: pass --initial-soc"
-        if not self.posterior.stated:
-            return "no fault is stated"
-        if any(self.corrections[fault].is_better for fault in self.posterior.stated):
-            return "the SoC error of these logs would grow with it"
-        return "it does not surely make the voltage error of left-out rows smaller"
+        return text.why_not(self)
 
     @property
     def is_written(self) -> bool:
@@ -163,10 +157,13 @@ class Diagnosis:
             after = self._held_out.corrected_soc_errors_pct(self.correction)
         elif self.lacks:
             after = self._soc_errors_pct(self._healthy_model)
-        known = np.isfinite(before) & np.isfinite(after)
-        if not known.any():
-            return None
-        return float(before[known].mean()), float(after[known].mean())
+        means = mean_errors(before, after)
+        return None if math.isnan(means[0]) else means
+
+    def soc_mae_pct(self, correction: Correction) -> tuple[float, float]:
+        """Return the mean SoC errors of left-out rows without and with a correction [%]."""
+        after = self._held_out.corrected_soc_errors_pct(correction)
+        return mean_errors(self._held_out.soc_errors_pct, after)
 
     def _soc_errors_pct(self, model: Model) -> FloatArray:
         return np.concatenate([soc_errors_pct(model, log) for log in self.rows])
@@ -215,16 +212,7 @@ class Diagnosis:
     @property
     def check_first(self) -> str:
         """What to do first, in a sentence."""
-        if self.next_step is not None:
-            return str(text.FAULT[self.next_step[0]]["instruction"])
-        if self.posterior.level == "none":
-            if self.posterior.leans_to_fault:
-                return "Nothing to repair yet: diagnose one more log like these with them."
-            return "Nothing to do."
-        return (
-            "Check that the references are of this pack and without the fault; then look where the"
-            " error lies."
-        )
+        return text.check_first(self)
 
     def visible_from(self, effect: str) -> tuple[float | None, str]:
         """Return the smallest size of an effect that these logs would have shown, and its unit."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final
@@ -13,8 +13,8 @@ import numpy as np
 
 from cangauge._text import counted, number, significant
 from cangauge.diagnosis.posterior import ALIKE, Posterior
-from cangauge.diagnosis.rows import COVER_PCT
-from cangauge.diagnosis.where import clause
+from cangauge.diagnosis.rows import COVER_PCT, Trace
+from cangauge.diagnosis.where import rms, where_sentence
 from cangauge.logs.gaps import bridge_s
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ def volts(value: float) -> str:
     return significant(value, 2, "V")
 
 
-def sentence(found: Diagnosis, evidence: Evidence, pack: Pack) -> str:
-    """Return what an effect does to a pack, how much and how sure, without the sentence's end."""
+def sentence(evidence: Evidence, pack: Pack, logs: Sequence[Trace]) -> str:
+    """Return what an effect in logs does to a pack, how much and how sure, without the end."""
     shape, size, half = evidence.shape, evidence.size, evidence.half_width
     values, words = shape.values(size), FAULT[shape.effect.fault]
     key = f"{shape.effect.id}_late" if values.get("late") else shape.effect.id
@@ -69,9 +69,11 @@ def sentence(found: Diagnosis, evidence: Evidence, pack: Pack) -> str:
         most = significant(value + wide, digits, unit)
         return f"{significant(value, digits, unit)} ({least}–{most}"
 
-    start_pct = found.rows[0].trace.start_pct
+    start_pct = logs[0].start_pct
+    is_one, begins = len(logs) == 1, logs[evidence.shapes.index(shape)]
     fields = {
-        "log": "The log" if len(found.rows) == 1 else "The first log",
+        "log": "The log" if is_one else "The first log",
+        "of_log": "" if is_one else f" of {begins.log.name}",
         "size": shown(1.0, shown_unit(shape.unit)),
         "percent": shown(100.0, "%"),
         "milli": shown(1e3, f"m{shape.unit}"),
@@ -119,9 +121,12 @@ def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     """Return what the model misses on the healthy logs, and what to do about it."""
     error_v, name = volts(check.references_rmse_v), "simulator" if found.simulator else "model"
     given = found.model.extended_model().pack
-    missed = "; ".join(_lower(sentence(found, each.evidence, given)) for each in check.missed)
-    what = f"to it they look as if {missed}" if missed else "none of the nine faults explains it"
-    among = f"{volts(check.among_themselves_rmse_v)} among themselves"
+    references = found.healthy.references
+    missed = "; ".join(_lower(sentence(each.evidence, given, references)) for each in check.missed)
+    what = "none of the nine faults explains it"
+    if missed:
+        what = f"compared with the {name}, {missed}"
+    among = f"they miss each other by {volts(check.among_themselves_rmse_v)}"
     lines = [f"The {name} misses the healthy logs by {error_v} ({among}): {what}."]
     if missed:
         lines.append(f"Error {error_v} → {volts(check.missed[-1].rmse_v)} with this corrected.")
@@ -145,15 +150,16 @@ def _what(found: Diagnosis) -> str:
     posterior = found.posterior
     none = f"P(no fault) {percent(posterior.none)}"
     if posterior.level == "none":
-        rest = f", {_likeliest(posterior)}" if posterior.leans_to_fault else ""
-        return f"No significant gap beyond that of healthy logs: {none}{rest}."
-    sure = "" if posterior.level == "gap" else f" Likely, not certain: {none}."
+        if not posterior.leans_to_fault:
+            return f"No significant gap beyond that of healthy logs: {none}."
+        but = "but a fault is likelier than none"
+        return f"No significant gap, {but}: {none}, {_likeliest(posterior)}."
+    sure = "" if posterior.level == "gap" else f" A fault is likely, not certain: {none}."
     if not posterior.stated:
         unknown = percent(posterior.unknown)
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
-    first, *others = (
-        sentence(found, found.best_of(fault), found.healthy.model.pack) for fault in posterior.named
-    )
+    pack, logs = found.healthy.model.pack, [rows.trace for rows in found.rows]
+    first, *others = (sentence(found.best_of(fault), pack, logs) for fault in posterior.named)
     if not posterior.is_sure:
         is_likelier_than_not = posterior.within_gap(posterior.stated[0]) > 0.5
         begin = "Most likely" if is_likelier_than_not else "The cause is not clear. Most probable:"
@@ -185,11 +191,11 @@ def _likeliest(posterior: Posterior) -> str:
 def _how_far(found: Diagnosis) -> str:
     """Return the error as it is, corrected, and of healthy logs; and where it lies."""
     whose = "healthy logs of this pack have" if found.has_references else "the model file states"
-    where, error = clause(found.where), volts(found.baseline_rmse_v)
+    error = volts(found.baseline_rmse_v)
     if found.is_corrected:
         error += f" → {volts(found.extended_rmse_v)} with {_corrected(found)}"
-    place = f"{where[0].upper()}{where[1:]}.{_uncertain(found)}"
-    return f"Error {error}; {whose} {volts(found.healthy_rmse_v)}. {place}"
+    place = where_sentence(found.where)
+    return f"Error {error}; {whose} {volts(found.healthy_rmse_v)}. {place}{_uncertain(found)}"
 
 
 def _uncertain(found: Diagnosis) -> str:
@@ -218,21 +224,66 @@ def _corrected(found: Diagnosis) -> str:
 
 
 def _to_do(found: Diagnosis) -> str:
+    """Return what to do first, and what there is of a corrected model."""
     if found.posterior.level == "none":
-        seen = [
-            f"{significant(size, 2, shown_unit(unit))} ({name.replace('_', ' ')})"
-            for name in SHOWN_VISIBLE
-            for size, unit in [found.visible_from(name)]
-            if size is not None
-        ]
-        shown = f" These logs would have shown {', '.join(seen)}." if seen else ""
-        return f"{found.check_first}{shown}"
-    model = "A corrected model is at hand (--extended MODEL, `extended_model()`)."
+        return f"{found.check_first}{_would_have_shown(found)}"
+    model = "--extended FILE.json saves the corrected model (in Python: `extended_model.save`)."
     if found.why_not is not None:
         model = f"No correction: {found.why_not}."
     elif found.correction_path:
         model = f"Corrected model: {found.correction_path}"
     return f"{found.check_first} {model}"
+
+
+def _would_have_shown(found: Diagnosis) -> str:
+    """Return the smallest sizes of common effects that would have been visible, in a sentence."""
+    seen = [
+        f"a {name.replace('_', ' ')} of {significant(size, 2, shown_unit(unit))}"
+        for name in SHOWN_VISIBLE
+        for size, unit in [found.visible_from(name)]
+        if size is not None
+    ]
+    return f" These logs would have shown {', '.join(seen)}." if seen else ""
+
+
+def check_first(found: Diagnosis) -> str:
+    """Return what to do first, in a sentence."""
+    posterior = found.posterior
+    if found.next_step is not None:
+        measured, stated = found.next_step[0], posterior.stated
+        instruction = str(FAULT[measured]["instruction"])
+        if measured == stated[0]:
+            return instruction
+        first, second = map(_title, stated)
+        return f"To tell the {first} from the {second}: {_lower(instruction)}"
+    if posterior.level != "none":
+        return (
+            "Check that the references are of this pack and without the fault; then look where the"
+            " error lies."
+        )
+    if posterior.leans_to_fault:
+        return "Before any repair, diagnose one more log like these together with them."
+    return "Nothing to do."
+
+
+def why_not(found: Diagnosis) -> str | None:
+    """Return why there is no correction to write; None where there is one."""
+    if found.is_written:
+        return None
+    if found.correction is not None:
+        return "a wrong start belongs to these logs and not to the model: pass --initial-soc"
+    tried = [found.corrections[fault] for fault in found.posterior.stated]
+    if not tried:
+        return "no fault is stated"
+    for correction in tried:
+        if correction.is_better:
+            before, after = (number(x, 2, "%") for x in found.soc_mae_pct(correction))
+            with_it = f"with the {_title(correction.evidence.fault)} corrected"
+            return f"{with_it}, the SoC error of left-out rows grows ({before} → {after})"
+    first = tried[0]
+    change = f"{volts(rms(first.errors.before_v))} → {volts(first.rmse_v)}"
+    with_it = f"with the {_title(first.evidence.fault)} corrected"
+    return f"{with_it}, the voltage error of left-out rows does not surely shrink ({change})"
 
 
 def caveats(found: Diagnosis) -> list[str]:
@@ -284,7 +335,7 @@ def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:
 def plan_text(found: Diagnosis) -> str:
     """Return what the next measurement is expected to bring, in a sentence."""
     if found.next_step is None:
-        return "Next step: none; there is no fault to settle."
+        return f"Next step: {_lower(found.check_first)}"
     fault, before, after = found.next_step
     return (
         f"Next step: {FAULT[fault]['measurement']}. The probability of the true fault would rise"

@@ -75,7 +75,8 @@ class Errors:
     def growth(self, before: FloatArray, after: FloatArray) -> tuple[float, float]:
         """Return how much larger a mean error is after than before, as its 95 % interval.
 
-        By a bootstrap over pieces, on the rows where both are finite; infinite where there is none.
+        By a bootstrap over pieces, on the rows where it changes: a step changes none before it.
+        Infinite where the errors are known on no row.
 
         Parameters
         ----------
@@ -85,8 +86,11 @@ class Errors:
         known = np.isfinite(before) & np.isfinite(after)
         if not known.any():
             return math.inf, math.inf
-        rows = self.drawn(known.astype(np.float64))
-        change = self.drawn(np.where(known, after - before, 0.0))
+        changed = known & (before != after)
+        if not changed.any():
+            return 0.0, 0.0
+        rows = self.drawn(changed.astype(np.float64))
+        change = self.drawn(np.where(changed, after - before, 0.0))
         low, high = np.quantile(change[rows > 0.0] / rows[rows > 0.0], [0.025, 0.975])
         return float(low), float(high)
 
@@ -160,15 +164,16 @@ def surely(place: Mapping[str, Any]) -> float:
     return float(place["ci"][0])
 
 
-def clause(where: Sequence[Mapping[str, Any]]) -> str:
-    """Return where the error is larger than elsewhere, in a clause."""
+def where_sentence(where: Sequence[Mapping[str, Any]]) -> str:
+    """Return where the error is larger than elsewhere, in a sentence."""
     worst = [place for place in where if stands_out(place)]
     if not worst:
-        return "everywhere alike"
+        return "The error is alike everywhere."
     surest = max(worst, key=surely)
     alike = [place["range"] for place in where if place["axis"] == surest["axis"]]
+    place = _place(surest, alike[0][0], alike[-1][1])
     times = number(surest["excess"], 1)
-    return f"{_place(surest, alike[0][0], alike[-1][1])} ({times} times that of all rows)"
+    return f"{place[0].upper()}{place[1:]} the error is {times} times that of all rows."
 
 
 def _place(place: Mapping[str, Any], first: float, last: float) -> str:

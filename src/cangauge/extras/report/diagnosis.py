@@ -75,14 +75,14 @@ def _shrinks(found: Diagnosis) -> Figure:
     if found.is_corrected:
         entries.insert(1, ("corrected", found.extended_rmse_v, BLUE))
         title = "How far it shrinks"
-        left_out = "the log left out" if len(found.logs) > 1 else "rows that did not size it"
-        caption = f"RMS error of the voltage, corrected on {left_out}."
+        left_out = "each log" if len(found.logs) > 1 else "each part of the log"
+        caption += f" The correction of {left_out} is sized by the others."
         closed, _ = found.closed
         if closed is not None:
             caption += f" It closes {percent(closed)} of the squared gap above healthy logs."
     if found.soc_errors_pct is not None:
         before, after = (number(each, 2, "%") for each in found.soc_errors_pct)
-        caption += f" SoC error, start withheld: {before}, corrected {after}."
+        caption += f" Mean SoC error with the start withheld: {before}, corrected {after}."
     return bars(title, "RMS error", entries, caption, unit="V")
 
 
