@@ -80,3 +80,15 @@ def test_killed_started_again_and_stopped(tmp_path: Path) -> None:
     # The seconds that starting took are counted by the mean current before: 10 s at 60 A are 0.3 %.
     assert ended.json["estimate"]["soc_pct"] == pytest.approx(kept_pct, abs=1.0)
     assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
+
+
+def test_a_read_only_file_system_stops_no_start() -> None:
+    address = BusAddress("udp_multicast", ADDRESS, {"port": PORT})
+    with BusConnection(open_bus(address, [standard_filter(0x5A0)]), address) as port:
+        service = Command("run", *BUS, *MODEL, "--state", "/sys/state.json", "--initial-soc", "80")
+        service.wait_for("service.ready")
+        drive(port, 0, 20)
+        service.wait_for("state not written: /sys/state.json")
+        assert collect(port, 0.5)
+        service.process.send_signal(signal.SIGTERM)
+        assert service.end().code == 0

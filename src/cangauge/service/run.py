@@ -14,7 +14,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from cangauge._files import check_writable
 from cangauge._logging import emit
 from cangauge._text import known_soc, number
 from cangauge.bus.reconnecting import ReconnectingBus
@@ -235,14 +234,16 @@ class Service:
         return self.config if problem is None else None
 
     def _check_files(self, config: RunConfig) -> None:
-        """Raise InputError if state or recording cannot be written, or if two files are one."""
+        """Raise InputError if the recording cannot be written, or if two files are one.
+
+        A state that cannot be written never stops the service: `StateKeeper` logs it.
+        """
         if self._state is not None:
             for other in filter(None, (config.model, config.record, config.dbc, config.map)):
                 if os.path.realpath(other) == os.path.realpath(self._state):
                     raise InputError(
                         "is another file of this service", field="--state", value=other
                     )
-            check_writable(self._state)
         if config.record is not None:
             check_recording(Path(config.record), *self._record_limits)
 
