@@ -42,6 +42,8 @@ OWN_GAUGE = (
     " --initial-soc {soc} --time-source replay-clock"
 )
 PROCESSES = "tests/nightly/test_whole_processes.py"
+AT_ONCE = "-n 3 --dist worksteal"
+"""Ten minutes of one of these tests are idle: the others run meanwhile."""
 GATEWAY = "-m socketcan tests/nightly/test_gateway_process.py"
 VCAN = "--interface socketcan --channel vcan0 --minutes 10 --bare-minutes 1 --highest 12000"
 LOAD = "--only loss --wanted 0.05 --highest 12000 --minutes 29 --bare-minutes 1"
@@ -60,7 +62,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
     missing = "no folder of recorded logs: --data FOLDER"
     return {
         "inputs": [[python, "-m", "pytest", "tests/nightly", f"--ignore={PROCESSES}"]],
-        "process": [[python, "-m", "pytest", PROCESSES]],
+        "process": [[python, "-m", "pytest", *AT_ONCE.split(), PROCESSES]],
         "faults": [[python, "-m", "faults", *bus]],
         "grade": [
             [python, "-m", "packs", "--data", str(data)],

@@ -171,7 +171,7 @@ def stated_by_zip(path: Path) -> None:
 
 
 def stated_by_the_blocks_of_bzip2(path: Path) -> None:
-    """Write 1.1 GB in bzip2, which takes some 40 s to unpack."""
+    """Write 1.1 GB of rows in bzip2."""
     path.write_bytes(bz2.compress(LOG) + 275 * bz2.compress(b"1,1,1,1\n" * (MIB // 2)))
 
 
