@@ -40,6 +40,12 @@ V13 = {
 }  # fmt: skip
 
 
+def opened(bus: BrokenBus) -> ReconnectingBus:
+    found = ReconnectingBus(BusAddress("virtual", "broken"), [], lambda *_: bus)
+    found.open()
+    return found
+
+
 def frame(number: int, data: str | bytes) -> can.Message:
     payload = bytes.fromhex(data) if isinstance(data, str) else data
     return can.Message(arbitration_id=number, is_extended_id=False, data=payload)
@@ -115,6 +121,22 @@ def test_frames_that_waited_while_the_gateway_was_stopped_are_dropped(tmp_path: 
             assert came.arbitration_id == 0x356
 
 
+def test_frames_behind_one_at_which_the_process_was_stopped_are_dropped() -> None:
+    class Stopped(Gateway):
+        def replaced(self, frame: can.Message, now_s: float) -> can.Message:
+            time.sleep(1.1 * DOUBT_S)
+            return super().replaced(frame, now_s)
+
+    now_s, told = time.time(), BrokenBus([])
+    came = [can.Message(now_s, 0x351, is_extended_id=False, data=bytes(8)) for _ in range(3)]
+    found = Stopped.__new__(Stopped)
+    found._battery, found._inverter = opened(BrokenBus([*came])), opened(told)
+    found._fields, found._own_ids = soc_fields("pylontech"), frozenset
+    found._ever_own, found._without_fd = set(), []
+    found._hand_on_pending()
+    assert len(told.sent) == 1
+
+
 @pytest.mark.parametrize(
     ("soc_pct", "told_pct"), [(99.4, 99), (99.5, 99), (99.99, 99), (100.0, 100)]
 )
@@ -166,12 +188,7 @@ def test_a_frame_that_waits_for_room_is_not_sent_long_after_a_doubt() -> None:
             super().send(message)
 
     full, own = Full([]), frame(0x355, V12[0x355])
-    battery, inverter = (
-        ReconnectingBus(BusAddress("virtual", "full"), [], lambda *_, bus=bus: bus)  # type: ignore[misc]
-        for bus in (BrokenBus([]), full)
-    )
-    for bus in (battery, inverter):
-        bus.open()
+    battery, inverter = opened(BrokenBus([])), opened(full)
     found = Gateway.__new__(Gateway)
     found._battery, found._inverter, found._without_fd = battery, inverter, []
     found._hand_on(own, inverter)

@@ -173,27 +173,28 @@ class Gateway(Output):
 
     def _hand_on_pending(self) -> None:
         """Hand on what has come in both directions."""
-        frames = self._pending(self._battery)
+        frames = self._battery.receive_pending(POLL_S)
         self._ever_own |= self._own_ids()
         for frame in frames:
-            if frame.is_extended_id or frame.arbitration_id not in self._ever_own:
+            is_own = not frame.is_extended_id and frame.arbitration_id in self._ever_own
+            if not is_own and self._is_current(frame, self._battery):
                 self._hand_on(self.replaced(frame, time.monotonic()), self._inverter)
-        for frame in self._pending(self._inverter):
-            self._hand_on(frame, self._battery)
+        for frame in self._inverter.receive_pending(POLL_S):
+            if self._is_current(frame, self._inverter):
+                self._hand_on(frame, self._battery)
 
-    def _pending(self, bus: ReconnectingBus) -> list[can.Message]:
-        """Return the frames that have come, without those that waited: this process was stopped.
+    def _is_current(self, frame: can.Message, bus: ReconnectingBus) -> bool:
+        """Return whether a frame has just come; else it waited, since this process was stopped.
 
         The limits that a battery allowed long ago are no limits, and the next ones follow at once.
+        Asked for each frame: the process may be stopped between two of them.
         """
-        frames = bus.receive_pending(POLL_S)
-        if bus.address.stamps == "driver":  # by another clock
-            return frames
-        current = [each for each in frames if time.time() - each.timestamp <= DOUBT_S]
-        if len(current) < len(frames):
-            text = f"frames of {bus.name} that had waited longer than {DOUBT_S} s are dropped"
-            emit(_LOG, logging.WARNING, "inverter.late", text)
-        return current
+        is_of_this_clock = bus.address.stamps != "driver"
+        if not is_of_this_clock or time.time() - frame.timestamp <= DOUBT_S:
+            return True
+        text = f"frames of {bus.name} that had waited longer than {DOUBT_S} s are dropped"
+        emit(_LOG, logging.WARNING, "inverter.late", text)
+        return False
 
     def _hand_on(self, frame: can.Message, bus: ReconnectingBus) -> None:
         """Send what a bus can carry: a frame that it cannot would count as a lost bus."""
