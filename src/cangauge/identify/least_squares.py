@@ -84,9 +84,9 @@ class LogSums:
 
 def load_features(temperature_c: FloatArray, currents_a: FloatArray) -> FloatArray:
     """Return T − T_r [K], Im [A] and a(T)·Im [A], shape (n, 1 + 2M)."""
-    colder = resistance_factor(temperature_c)[:, None]
-    above = (temperature_c - REFERENCE_C)[:, None]
-    return np.concatenate([above, currents_a, colder * currents_a], axis=1)
+    a = resistance_factor(temperature_c)[:, None]
+    warmer_k = (temperature_c - REFERENCE_C)[:, None]
+    return np.concatenate([warmer_k, currents_a, a * currents_a], axis=1)
 
 
 def row_weights(soc_pct: FloatArray, row_s: float, chemistry: Chemistry) -> FloatArray:

@@ -116,8 +116,8 @@ class Chemistry:
 
     def level_v(self, mean_v: float, mean_c: ArrayLike = REFERENCE_C) -> FloatArray:
         """Return the voltage error that lasts a log, of mean voltage and temperature [V]."""
-        colder = np.maximum(1.0, resistance_factor(mean_c))
-        return np.asarray(self.level_std * mean_v * colder**self.cold_exponent)
+        a = np.maximum(1.0, resistance_factor(mean_c))
+        return np.asarray(self.level_std * mean_v * a**self.cold_exponent)
 
 
 def _curve(table: Mapping[float, float]) -> FloatArray:

@@ -61,8 +61,8 @@ def inverse_k(temperature_c: ArrayLike) -> FloatArray:
 
 def resistance_factor(temperature_c: ArrayLike) -> FloatArray:
     """Return a(T), the resistance relative to that at 20 °C by Arrhenius' law."""
-    colder = inverse_k(temperature_c) - inverse_k(REFERENCE_C)
-    return np.asarray(np.exp(ACTIVATION_K * colder))
+    colder_per_k = inverse_k(temperature_c) - inverse_k(REFERENCE_C)
+    return np.asarray(np.exp(ACTIVATION_K * colder_per_k))
 
 
 class Functions(Fields):
@@ -255,9 +255,9 @@ class VoltageModel:
         bounded = np.clip(np.asarray(temperature_c, dtype=np.float64), *self.temperature_limits_c)
         columns = [np.atleast_1d(bounded)[:, None] - self.loads.t_ref_c, currents_a]
         if (arrhenius := self.loads.arrhenius) is not None:
-            colder = resistance_factor(bounded) / arrhenius.warm - 1.0
-            drop = currents_a @ np.array(arrhenius.resistance_ohm)
-            columns.append((colder * drop)[:, None])
+            change = resistance_factor(bounded) / arrhenius.warm - 1.0
+            drop_v = currents_a @ np.array(arrhenius.resistance_ohm)
+            columns.append((change * drop_v)[:, None])
         return np.concatenate(columns, axis=1)
 
     def pseudo_ocv(self, soc_pct: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
