@@ -144,6 +144,14 @@ static void weigh(linear *at, const cg_ekf *ekf, int32_t size, cg_real noise)
     }
 }
 
+/* P v of the covariance of the biases, and v' P v. */
+static cg_real bias_spread(const cg_ekf *ekf, const cg_real *v, cg_real *spread)
+{
+    spread[0] = cg_dot(ekf->b_p[0], v, 2);
+    spread[1] = cg_dot(ekf->b_p[1], v, 2);
+    return cg_dot(v, spread, 2);
+}
+
 /* P <- P - K (P H')', symmetric; then the biases (Friedland). */
 static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_v)
 {
@@ -163,16 +171,15 @@ static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_
         ekf->b_v[k][0] -= at->gain[k] * t[0];
         ekf->b_v[k][1] -= at->gain[k] * t[1];
     }
-    const cg_real spread[2] = {cg_dot(ekf->b_p[0], t, 2), cg_dot(ekf->b_p[1], t, 2)};
-    const cg_real variance = at->variance + cg_dot(t, spread, 2);
+    cg_real spread[2];
+    const cg_real variance = at->variance + bias_spread(ekf, t, spread);
     const cg_real left = at->innovation - cg_dot(t, ekf->b, 2);
     const cg_real gain[2] = {spread[0] / variance, spread[1] / variance};
     ekf->b[0] += gain[0] * left;
     ekf->b[1] += gain[1] * left;
     ekf->b_p[0][0] -= gain[0] * spread[0];
     ekf->b_p[1][1] -= gain[1] * spread[1];
-    ekf->b_p[0][1] = R(0.5) * ((ekf->b_p[0][1] - (gain[0] * spread[1])) +
-                               (ekf->b_p[1][0] - (gain[1] * spread[0])));
+    ekf->b_p[0][1] -= gain[0] * spread[1];
     ekf->b_p[1][0] = ekf->b_p[0][1];
 }
 
@@ -285,16 +292,18 @@ static void ekf_correct(cg_ekf *ekf, int32_t size, cg_real soc_pct, cg_real std_
     condition(ekf, &at, size, R(0.0));
 }
 
-/* SoC and its variance after charge, without a change of the state; with the square of what the
- * learned capacity and resistance imply. */
+/* SoC and its variance after charge, without a change of the state; with the mean square error by
+ * the biases. */
 static cg_real soc_after(const cg_ekf *ekf, const cg_model *model, const cg_passed *passed,
                          cg_real *var_pct2)
 {
     const cg_real a = offset_gain(model, passed->seconds);
+    const cg_real *v = ekf->b_v[CG_X_SOC];
+    cg_real spread[2];
     *var_pct2 = var_of(ekf, CG_X_SOC) + (R(2.0) * a * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)]) +
                 (a * a * var_of(ekf, CG_X_OFFSET)) +
                 (R(DRIFT_PCT2_PER_S) * passed->seconds) + passed->variance_pct2 +
-                cg_square(cg_dot(ekf->b_v[CG_X_SOC], ekf->b, 2));
+                cg_square(cg_dot(v, ekf->b, 2)) + bias_spread(ekf, v, spread);
     return ekf->x[CG_X_SOC] + (a * ekf->x[CG_X_OFFSET]) - passed->discharged_pct;
 }
 
@@ -374,9 +383,9 @@ void cg_filter_take_over(cg_filter *filter, const cg_model *model, const cg_mode
     const cg_ekf *before = cg_likelier(filter, model_before);
     const cg_real capacity_ratio = model->capacity_ah / model_before->capacity_ah;
     const cg_real *v = before->b_v[CG_X_OFFSET];
-    const cg_real spread[2] = {cg_dot(before->b_p[0], v, 2), cg_dot(before->b_p[1], v, 2)};
+    cg_real spread[2];
     const cg_real offset_a = before->x[CG_X_OFFSET] + cg_dot(v, before->b, 2);
-    const cg_real offset_var = var_of(before, CG_X_OFFSET) + cg_dot(v, spread, 2);
+    const cg_real offset_var = var_of(before, CG_X_OFFSET) + bias_spread(before, v, spread);
     const cg_real capacity = (R(1.0) + before->b[CG_B_CAPACITY]) * capacity_ratio;
     const cg_real capacity_var = before->b_p[CG_B_CAPACITY][CG_B_CAPACITY];
     cg_filter_start(filter, model, soc_pct, std_pct, false);

@@ -160,10 +160,18 @@ def test_prediction_between_blocks_equals_the_filters_own() -> None:
     filter_ = SocFilter(LinearModel(), 60.0, 5.0)
     run(filter_, voltages(5, 4))
     soc_pct, variance = filter_.soc_moments_after(17.0, 0.4, 0.02)
-    by_biases_pct = filter_.bias.V[0] @ filter_.bias.b
+    by_biases_pct2 = filter_.bias.mean_square(0)
     filter_.predict(17.0, 0.4, 0.02)
     assert soc_pct == pytest.approx(filter_.x[0], abs=1e-12)
-    assert variance == pytest.approx(filter_.P[0, 0] + by_biases_pct**2, abs=1e-12)
+    assert variance == pytest.approx(filter_.P[0, 0] + by_biases_pct2, abs=1e-12)
+
+
+def test_the_variance_of_the_soc_is_its_mean_square_error_under_all_that_is_learned() -> None:
+    filter_ = SocFilter(LinearModel(), 60.0, 5.0)
+    run(filter_, voltages(5, 4))
+    x, P = filter_.joint()
+    soc_pct, variance = filter_.soc_moments_after(0.0, 0.0)
+    assert variance == pytest.approx(P[0, 0] + (x[0] - soc_pct) ** 2, abs=1e-12)
 
 
 @pytest.mark.parametrize("wrong_pct", [0.0, 3.0, 30.0])

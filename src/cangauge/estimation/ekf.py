@@ -249,14 +249,14 @@ class SocFilter:
     ) -> tuple[float, float]:
         """Return the predicted SoC and its variance [%, %²] without changing the state.
 
-        The variance contains the square of the error that the learned capacity and resistance
-        imply for the SoC, which counts with those of the model.
+        The variance contains the mean square error by the biases: the SoC counts with the capacity
+        and resistance of the model, not with the learned ones.
         """
         a = 100.0 * seconds / (3600.0 * self.model.capacity_ah)
         x, P = self.x, self.P
         variance = P[SOC, SOC] + 2.0 * a * P[SOC, OFFSET] + a * a * P[OFFSET, OFFSET]
         variance += DRIFT_PCT2_PER_S * seconds + variance_pct2
-        variance += (self.bias.V[SOC] @ self.bias.b) ** 2
+        variance += self.bias.mean_square(SOC)
         return float(x[SOC] + a * x[OFFSET] - discharged_pct), float(variance)
 
     @property

@@ -98,6 +98,11 @@ class FriedlandBias:
         P = self.P - np.outer(Kb, PTt)
         self.P = 0.5 * (P + P.T)
 
+    def mean_square(self, state: int) -> float:
+        """Return the mean square of the error of a state, (V b)² + V P Vᵀ, in the state's unit."""
+        v = self.V[state]
+        return float((v @ self.b) ** 2 + v @ self.P @ v)
+
     @property
     def relative(self) -> FloatArray:
         """Both in standard deviations of their prior, shape (2,)."""
