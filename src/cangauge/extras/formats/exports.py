@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import pyarrow.compute as pc
@@ -24,27 +24,14 @@ from cangauge.logs.values import numbers_of
 from cangauge.settings import TemperatureSource
 
 
-class _Column(NamedTuple):
-    """A heading; `simple` is it without unit, blanks and underscores, in lower case."""
-
-    place: int
-    text: str
-    simple: str
-    unit: str
+def _simple(heading: str) -> str:
+    """Return a heading without unit, blanks and underscores, in lower case."""
+    return re.sub(r"[\s_]", "", parse_heading(heading).name).lower()
 
 
-def _columns(cells: Sequence[str]) -> list[_Column]:
-    parts = [(text, *parse_heading(text)) for text in cells]
-    return [_Column(k, text, _simple(name), unit) for k, (text, name, unit, _) in enumerate(parts)]
-
-
-def _simple(name: str) -> str:
-    return re.sub(r"[\s_]", "", name).lower()
-
-
-def _matching(columns: Sequence[_Column], *patterns: str) -> list[_Column]:
-    """Return the columns of some patterns, the first pattern's first."""
-    return [each for one in patterns for each in columns if re.fullmatch(one, each.simple)]
+def _matching(headings: Sequence[str], *patterns: str) -> list[int]:
+    """Return the places of the simple headings of some patterns, the first pattern's first."""
+    return [k for one in patterns for k, text in enumerate(headings) if re.fullmatch(one, text)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +106,7 @@ class Export:
             If a column is missing, or holds anything but numbers.
         """
         header, skip_lines = self._header(head) or ([], 0)
-        columns = _columns(header)
+        columns = [*map(_simple, header)]
         sensors, ambient = _matching(columns, self.sensors), _matching(columns, self.ambient)[:1]
         named = {name: _matching(columns, *each)[:1] for name, each in self.columns.items()}
         pairs = {
@@ -129,12 +116,12 @@ class Export:
         excluded = _matching(columns, "exclude")[:1] if self.bare else []
         wanted = chain(sensors, ambient, excluded, *named.values(), *chain(*pairs.values()))
         table = TextTable(head, self.delimiter, header, (), skip_lines, [])
-        cells = table.columns([column.place for column in wanted])
-        draft = DraftLog(head.name, str(head.path))
-        draft.remarks += [f"{self.name} export", *table.remarks]
+        cells = table.columns([*wanted])
+        remarks = [f"{self.name} export", *table.remarks]
+        draft = DraftLog(head.name, str(head.path), headings=tuple(header), remarks=remarks)
         for quantity, found in named.items():
-            for column in found:
-                _take(draft, quantity, column, _values(draft, cells, column, quantity))
+            for place in found:
+                _take(draft, quantity, place, _values(draft, cells, place, quantity))
         _take_pair(draft, cells, pairs)
         for quantity in REQUIRED[:3]:
             if quantity not in draft.values:
@@ -144,8 +131,8 @@ class Export:
         if self.charges:
             draft.negate_current(f"{self.name} stores discharge as negative")
         self._take_temperature(draft, cells, sensors, ambient)
-        for column in excluded:
-            words = cells[column.place].cast("string")  # a column of 0 is one of numbers
+        for place in excluded:
+            words = cells[place].cast("string")  # a column of 0 is one of numbers
             is_excluded = pc.fill_null(pc.equal(words, "Yes"), fill_value=False)
             draft.keep(~np.asarray(is_excluded, dtype=bool), "that the cycler excludes dropped")
         if self.waits:
@@ -159,12 +146,12 @@ class Export:
         self,
         draft: DraftLog,
         cells: dict[int, Any],
-        sensors: Sequence[_Column],
-        ambient: Sequence[_Column],
+        sensors: Sequence[int],
+        ambient: Sequence[int],
     ) -> None:
         """Take the sensors, else the room's temperature or the set point, if any."""
         name = "temperature_c"
-        probes = {each.text: _values(draft, cells, each, name) for each in sensors}
+        probes = {draft.headings[k]: _values(draft, cells, k, name) for k in sensors}
         probes = {text: each for text, each in probes.items() if np.isfinite(each).any()}
         if probes:
             draft.take_probes([*probes], [*probes.values()])
@@ -172,8 +159,8 @@ class Export:
             draft.temperature_source = self.source
             if len(probes) > 1:
                 draft.remarks.append(f"temperature: median of {len(probes)} columns")
-        for column in () if probes else ambient:
-            _take(draft, name, column, _values(draft, cells, column, name))
+        for place in () if probes else ambient:
+            _take(draft, name, place, _values(draft, cells, place, name))
             draft.temperature_source = "room"
             draft.remarks.append("temperature: the room's, not the battery's")
         found = [*re.finditer(self.set_point, Path(draft.source).name, re.IGNORECASE)]
@@ -187,40 +174,40 @@ class Export:
             draft.remarks.append(shown)
 
 
-def _take(draft: DraftLog, quantity: str, column: _Column, values: FloatArray) -> None:
+def _take(draft: DraftLog, quantity: str, place: int, values: FloatArray) -> None:
     draft.values[quantity] = values
-    draft.labels[quantity] = column.text
+    draft.labels[quantity] = draft.headings[place]
 
 
-def _values(draft: DraftLog, cells: dict[int, Any], column: _Column, quantity: str) -> FloatArray:
+def _values(draft: DraftLog, cells: dict[int, Any], place: int, quantity: str) -> FloatArray:
     """Return a column in the canonical unit, with a remark if it is converted."""
-    numbers, _ = numbers_of(cells[column.place], draft.source, column.text)
-    values = convert(numbers, quantity, column.unit, source=draft.source, label=column.text)
+    text = draft.headings[place]
+    numbers, in_cells = numbers_of(cells[place], draft.source, text)
+    unit = parse_heading(text).unit or in_cells
+    values = convert(numbers, quantity, unit, source=draft.source, label=text)
     if values is not numbers:
-        draft.remarks.append(f"{column.text}: converted from {column.unit} to {quantity}")
+        draft.remarks.append(f"{text}: converted from {unit} to {quantity}")
     return values
 
 
-def _take_pair(
-    draft: DraftLog, cells: dict[int, Any], pairs: dict[str, list[list[_Column]]]
-) -> None:
+def _take_pair(draft: DraftLog, cells: dict[int, Any], pairs: dict[str, list[list[int]]]) -> None:
     """Take current and voltage of the first instrument that has both."""
-    taken: dict[str, tuple[str, _Column, FloatArray]] = {}
+    taken: dict[str, tuple[str, int, FloatArray]] = {}
     for instrument, pair in pairs.items():
         own = {}
         for quantity, found in zip(_DRIVING, pair, strict=True):
-            for column in found:
-                values = _values(draft, cells, column, quantity)
+            for place in found:
+                values = _values(draft, cells, place, quantity)
                 if instrument and not np.isfinite(values).any():
-                    draft.remarks.append(f"{column.text} is empty and was not used")
+                    draft.remarks.append(f"{draft.headings[place]} is empty and was not used")
                 else:
-                    own[quantity] = instrument, column, values
+                    own[quantity] = instrument, place, values
         if len(own) == len(_DRIVING):
             taken = own
             break
         taken = own | taken
-    for quantity, (instrument, column, values) in sorted(taken.items()):
-        _take(draft, quantity, column, values)
+    for quantity, (instrument, place, values) in sorted(taken.items()):
+        _take(draft, quantity, place, values)
         if instrument:
             draft.remarks.append(f"{quantity} from the {instrument}")
         if quantity == "current_a" and instrument == _CAN:
@@ -245,7 +232,7 @@ _INSTRUMENTS: Final = {
 def _cycler(name: str, time: str, current: str, voltage: str, *more: str, **how: Any) -> Export:
     """Return a cycler's export by its headings, in lower case."""
     headings = time, current, voltage
-    simple = [re.escape(_simple(parse_heading(heading).name)) for heading in headings]
+    simple = [re.escape(_simple(heading)) for heading in headings]
     known_by = tuple(map(re.escape, (*headings, *more)))
     return Export(name, known_by, {"time_s": (simple[0],)}, {"": (simple[1], simple[2])}, **how)
 
