@@ -108,29 +108,24 @@ def draft_of_table(
         raise UnknownColumnsError(where, headings, choice, given)
     chosen = choice.chosen
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
-    wanted = [place for column in chosen.values() for place in column.places]
-    wanted += [*words, *(place for place, _ in chosen["time"].others)]
-    beside = {k: k + 1 for k in wanted if _UNITS.search("".join(headings[k + 1 : k + 2]))}
-    wanted += beside.values()
-    counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, wanted)
+    measured = [place for column in chosen.values() for place in column.places]
     times = [*chosen["time"].places, *(place for place, _ in chosen["time"].others)]
-    cells = table.columns([*dict.fromkeys([*wanted, *counters])], apart=times)
+    taken = [*measured, *times, *words]
+    unit_columns = {k: k + 1 for k in taken if _UNITS.search("".join(headings[k + 1 : k + 2]))}
+    counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, taken)
+    wanted = dict.fromkeys([*taken, *unit_columns.values(), *counters])
+    cells = table.columns([*wanted], apart=times)
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
-    units = {place: _only_word(cells[k], where, headings[k]) for place, k in beside.items()}
+    units = {place: _only_word(cells[k], where, headings[k]) for place, k in unit_columns.items()}
     for quantity, column in chosen.items():
+        beside = next((units[place] for place in column.places if place in units), "")
         if quantity == "time":
-            chosen[quantity], unit = _take_time(draft, column, cells)
+            chosen[quantity], unit = _take_time(draft, column, cells, beside)
         else:
-            unit = _take(draft, quantity, column, cells, units)
+            unit = _take(draft, quantity, column, cells, beside)
         if not choice.is_canonical:
-            factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
-            label = draft.labels[FIELDS[quantity]]
-            shown = label if len(label) <= 80 else f"{label[:80]}…"
-            draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
-    for place, scale in counters.items():
-        with suppress(InputError):  # a column of words
-            count = numbers_of(cells[place], where, headings[place])[0]
-            draft.values[f"{COUNTER}{headings[place]}"] = count * scale
+            draft.assumed.append(_assumption(draft, quantity, column.factor, unit))
+    _take_counters(draft, cells, counters)
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
     word: str = chosen["temperature"].source if "temperature" in chosen else "unknown"
@@ -143,6 +138,23 @@ def draft_of_table(
         _direct(draft, chosen["current"], table)
         _hold_changes(draft)
     return draft
+
+
+def _assumption(draft: DraftLog, quantity: str, factor: float, unit: str) -> str:
+    """Return by which heading, factor and unit a quantity was read."""
+    label = draft.labels[FIELDS[quantity]]
+    shown = label if len(label) <= 80 else f"{label[:80]}…"
+    times = "" if factor == 1.0 else f" × {factor:g}"
+    return f'{quantity} = "{shown}"{times} [{unit}]'
+
+
+def _take_counters(draft: DraftLog, cells: dict[int, Any], counters: Mapping[int, float]) -> None:
+    """Take columns that may count the charge [Ah], less those of words."""
+    for place, scale in counters.items():
+        label = draft.headings[place]
+        with suppress(InputError):
+            count, _ = numbers_of(cells[place], draft.where, label)
+            draft.values[f"{COUNTER}{label}"] = count * scale
 
 
 def _counters(table: TextTable | ArrowTable, taken: Sequence[int]) -> dict[int, float]:
@@ -163,20 +175,16 @@ def _only_word(column: Any, where: str, label: str) -> str:
 
 
 def _take(
-    draft: DraftLog,
-    quantity: str,
-    column: ChosenColumn,
-    cells: dict[int, Any],
-    units: Mapping[int, str],
+    draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any], beside: str
 ) -> str:
     """Take a quantity in its canonical unit; return how the unit was found.
 
-    `units` are those that a column beside states, by place.
+    `beside` is the unit that a column beside states.
     """
     name, where, unit = FIELDS[quantity], draft.where, column.unit
     texts = _label(draft, name, column, " − " if quantity == "current" else " + ")
     read = [numbers_of(cells[k], where, text) for k, text in zip(column.places, texts, strict=True)]
-    for in_cells in [*(unit for _, unit in read), *(units.get(k, "") for k in column.places)]:
+    for in_cells in [*(in_cells for _, in_cells in read), beside]:
         if in_cells and unit and unit_of(name, in_cells) != unit_of(name, unit):
             problem = "the cells have another unit than the heading"
             cure = f"state the right one: --columns '{quantity}=HEADING[UNIT]'"
@@ -267,12 +275,14 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
 
 
 def _take_time(
-    draft: DraftLog, column: ChosenColumn, cells: dict[int, Any]
+    draft: DraftLog, column: ChosenColumn, cells: dict[int, Any], beside: str
 ) -> tuple[ChosenColumn, str]:
     """Take the time [s]; return its column and its reading; of several, one that increases.
 
-    A date beside a clock time is read with it, unless the user named the clock.
+    A date beside a clock time is read with it, unless the user named the clock. `beside` is the
+    unit that a column beside states.
     """
+    column = replace(column, unit=column.unit or beside)
     name, where = FIELDS["time"], draft.where
 
     def read(column: ChosenColumn) -> tuple[FloatArray, str]:
