@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -39,8 +40,8 @@ WRAPPED: Final = "a signed value was read as unsigned"
 """What is wrong with a current of one sign that wraps."""
 
 
-_Hypothesis = tuple[bool | np.bool, float, str, str, Sequence[str]]
-"""Whether something is wrong, by which value, the problem, the cure, and units to state instead."""
+_Doubt = tuple[float, str, str, Sequence[str]]
+"""What is wrong with a column: a value, the problem, the cure, and units to state instead."""
 
 
 def agreeing(
@@ -144,30 +145,40 @@ def _in_canonical_units(
             _of_temperature(log.temperature_c, usual_c, may_be_swapped=may_be_swapped),
         ),
     )
-    wrong: dict[str, _Hypothesis] = {}
-    for field, hypotheses in table:
-        for each in hypotheses:
-            if each[0]:
-                wrong.setdefault(field, each)
+    wrong: dict[str, _Doubt] = {}
+    for field, doubts in table:
+        for first in islice(doubts, 1):
+            wrong.setdefault(field, first)
+    if wrong:
+        raise _refusal(log, wrong, labels, stated)
+    if usual_c <= LIMITS["unusually_hot_c"]:
+        return log
+    remark = f"temperature {usual_c:.0f} °C is unusually hot"
+    if "temperature_c" not in stated:
+        option = _option({"temperature_c": (label_c, ["°F"])})
+        remark += f": if it is °F, state the unit: {option}"
+    return replace(log, remarks=(*log.remarks, remark))
+
+
+def _refusal(
+    log: Log, wrong: Mapping[str, _Doubt], labels: Mapping[str, str], stated: Collection[str]
+) -> InputError:
+    """Return the error of the first doubt; its cure states the units of all that have one."""
     named = {
         field: (labels[field], units)
         for field, (*_, units) in wrong.items()
         if units and field not in stated and labels.get(field, field).lower() != field
     }
-    for field, (_, value, problem, cure, _) in wrong.items():  # the first is raised
-        sure = {each: column for each, column in named.items() if len(column[1]) == 1}
-        options = sure if field in sure else {field: named[field]} if field in named else {}
-        how = f"{cure} (or state the unit: {_option(options)})" if options else cure
-        if len(options) > 1:
-            how = f"state the units: {_option(options)}"
-        where, label = log.source or log.name, labels.get(field, field)
-        raise InputError(problem, source=where, field=label, value=float(value), cure=how)
-    if usual_c <= LIMITS["unusually_hot_c"]:
-        return log
-    doubt = f": if it is °F, state the unit: {_option({'temperature_c': (label_c, ['°F'])})}"
-    remark = f"temperature {usual_c:.0f} °C is unusually hot"
-    remark += "" if "temperature_c" in stated else doubt
-    return replace(log, remarks=(*log.remarks, remark))
+    field, (value, problem, cure, _) = next(iter(wrong.items()))
+    options = {each: column for each, column in named.items() if len(column[1]) == 1}
+    if field not in options:
+        options = {each: column for each, column in named.items() if each == field}
+    if len(options) > 1:
+        cure = f"state the units: {_option(options)}"
+    elif options:
+        cure = f"{cure} (or state the unit: {_option(options)})"
+    where, label = log.source or log.name, labels.get(field, field)
+    return InputError(problem, source=where, field=label, value=float(value), cure=cure)
 
 
 def _option(columns: Mapping[str, tuple[str, Sequence[str]]]) -> str:
@@ -183,59 +194,40 @@ def _option(columns: Mapping[str, tuple[str, Sequence[str]]]) -> str:
     return f"--columns '{','.join(texts)}'{how}"
 
 
-# Hypotheses on a column, the likeliest first. Medians stand before single values, so that a few odd
+# Doubts on a column, the likeliest first. Medians stand before single values, so that a few odd
 # rows are not another unit.
 
 
-def _of_time(log: Log, in_seconds: bool | None) -> list[_Hypothesis]:
+def _of_time(log: Log, in_seconds: bool | None) -> Iterator[_Doubt]:
     first, step = float(log.time_s[0]), np.diff(log.time_s)
     usual = float(np.median(step)) if step.size else 1.0
     finer = _fitting(usual, ("ms", "us", "ns"))
     coarser = ["d"] if first > LIMITS["spreadsheet_d"] else _fitting(usual, ("min", "h", "d"))
-    looks_finer, looks_coarser = (
-        f"rows are {usual:g} apart: time looks like"
-        f" {' or '.join(_TIME_UNITS[unit] for unit in units) or 'another unit'}"
-        for units in (finer, coarser)
-    )
+    if first > LIMITS["stamp_s"]:
+        yield first, "time looks like milliseconds since 1970", "divide it by 1000", ["ms"]
+    convert, apart = "convert it to seconds", f"rows are {usual:g}"
+    if usual > LIMITS["interval_s"]:
+        too_slow = "a log with a row every 90 s or more cannot be used"
+        if in_seconds:
+            yield usual, f"{apart} s apart: {too_slow}", "export a row each minute", []
+        yield usual, f"{apart} apart: {_looks_like(finer)}", f"{convert} ({too_slow})", finer
+    if usual < 1.0 / LIMITS["rate_hz"] and not in_seconds:
+        yield usual, f"{apart} apart: {_looks_like(coarser)}", convert, coarser
     others = _other_units(log, finer, coarser) if in_seconds is None and step.size else []
-    convert = "convert it to seconds"
-    too_slow = "a log with a row every 90 s or more cannot be used"
-    is_slow, is_fast = usual > LIMITS["interval_s"], usual < 1.0 / LIMITS["rate_hz"]
-    longest = int(np.argmax(step)) + 1 if step.size else 0
+    if others:
+        problem, cure = "apart, in seconds or another unit", "name the unit in the heading"
+        yield usual, f"{apart} {problem}", cure, ["s", *others]
+    yield from _odd_row(log.time_s, -LIMITS["stamp_s"], LIMITS["stamp_s"], "a time in seconds")
     days = log.duration_s / _seconds("d")
-    return [
-        (
-            first > LIMITS["stamp_s"],
-            first,
-            "time looks like milliseconds since 1970",
-            "divide it by 1000",
-            ["ms"],
-        ),
-        (
-            is_slow and in_seconds,
-            usual,
-            f"rows are {usual:g} s apart: {too_slow}",
-            "export a row each minute",
-            [],
-        ),
-        (is_slow, usual, looks_finer, f"{convert} ({too_slow})", finer),
-        (is_fast and not in_seconds, usual, looks_coarser, convert, coarser),
-        (
-            others != [],
-            usual,
-            f"rows are {usual:g} apart, in seconds or another unit",
-            "name the unit in the heading",
-            ["s", *others],
-        ),
-        _odd_row(log.time_s, -LIMITS["stamp_s"], LIMITS["stamp_s"], "a time in seconds"),
-        (
-            days > LIMITS["log_d"],
-            float(log.time_s[longest]),
-            f"the log lasts {days:.0f} days; its longest step ends at row {longest + 1}",
-            "if the clock was set there, split the log there",
-            [],
-        ),
-    ]
+    if days > LIMITS["log_d"]:
+        row = int(np.argmax(step)) + 1
+        problem = f"the log lasts {days:.0f} days; its longest step ends at row {row + 1}"
+        yield float(log.time_s[row]), problem, "if the clock was set there, split the log there", []
+
+
+def _looks_like(units: Sequence[str]) -> str:
+    names = " or ".join(_TIME_UNITS[unit] for unit in units)
+    return f"time looks like {names or 'another unit'}"
 
 
 def _seconds(unit: str) -> float:
@@ -266,76 +258,56 @@ def _other_units(log: Log, finer: list[str], coarser: list[str]) -> list[str]:
     return coarser if is_coarse else []
 
 
-def _swapped(log: Log, usual_c: float, voltage_label: str) -> Iterator[_Hypothesis]:
-    is_volts = 273.15 + LIMITS["unusually_hot_c"] < usual_c <= LIMITS["voltage_v"]
+def _swapped(log: Log, usual_c: float, voltage_label: str) -> Iterator[_Doubt]:
     is_code = np.ptp(log.temperature_c) == 0.0
-    problem = f"it looks like a pack's voltage, and {voltage_label} like a temperature"
-    cure = "the two columns (or signals) look swapped: exchange them"
-    yield is_volts and not is_code, usual_c, problem, cure, []
+    if 273.15 + LIMITS["unusually_hot_c"] < usual_c <= LIMITS["voltage_v"] and not is_code:
+        problem = f"it looks like a pack's voltage, and {voltage_label} like a temperature"
+        yield usual_c, problem, "the two columns (or signals) look swapped: exchange them", []
 
 
-def _of_temperature(
-    celsius: FloatArray, usual: float, *, may_be_swapped: bool
-) -> list[_Hypothesis]:
+def _of_temperature(celsius: FloatArray, usual: float, *, may_be_swapped: bool) -> Iterator[_Doubt]:
     kind = "a battery's temperature in °C"
-    also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
-    is_kelvin = 200.0 <= usual <= 400.0
-    return [
-        (
-            is_kelvin,
-            usual,
-            "temperature looks like kelvin",
-            f"subtract 273.15{also}",
-            ["K"] if is_kelvin and np.any(celsius % 1.0) else ["K", "0.1°C"],
-        ),
-        (
-            10.0 * HOTTEST_C < usual <= 1000.0 * HOTTEST_C,
-            usual,
-            "temperature looks like thousandths of a degree",
-            "divide it by 1000",
-            ["0.001°C"],
-        ),
-        (not COLDEST_C <= usual <= HOTTEST_C, usual, f"this is not {kind}", "convert it to °C", []),
-        _odd_row(celsius, COLDEST_C, HOTTEST_C, kind),
-    ]
+    if 200.0 <= usual <= 400.0:
+        also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
+        units = ["K"] if np.any(celsius % 1.0) else ["K", "0.1°C"]
+        yield usual, "temperature looks like kelvin", f"subtract 273.15{also}", units
+    if 10.0 * HOTTEST_C < usual <= 1000.0 * HOTTEST_C:
+        problem = "temperature looks like thousandths of a degree"
+        yield usual, problem, "divide it by 1000", ["0.001°C"]
+    if not COLDEST_C <= usual <= HOTTEST_C:
+        yield usual, f"this is not {kind}", "convert it to °C", []
+    yield from _odd_row(celsius, COLDEST_C, HOTTEST_C, kind)
 
 
-def _of_voltage(volts: FloatArray, usual: float) -> list[_Hypothesis]:
-    return [
-        _in_finer_unit(usual, LIMITS["voltage_v"], "volts", "voltage"),
-        (
-            usual <= 0.0,
-            usual,
-            "the median voltage is not positive",
-            "check column and polarity",
-            [],
-        ),
-        (usual < 1.0, usual, "voltage looks like kilovolts", "convert it to volts", ["kV"]),
-        _odd_row(volts, -LIMITS["voltage_v"], LIMITS["voltage_v"], "a battery's voltage"),
-    ]
+def _of_voltage(volts: FloatArray, usual: float) -> Iterator[_Doubt]:
+    most = LIMITS["voltage_v"]
+    if abs(usual) > most:
+        yield _in_finer_unit(usual, most, "volts", "voltage")
+    if usual <= 0.0:
+        yield usual, "the median voltage is not positive", "check column and polarity", []
+    if usual < 1.0:
+        yield usual, "voltage looks like kilovolts", "convert it to volts", ["kV"]
+    yield from _odd_row(volts, -most, most, "a battery's voltage")
 
 
-def _of_current(log: Log) -> list[_Hypothesis]:
+def _of_current(log: Log) -> Iterator[_Doubt]:
     amps, most = log.current_a, LIMITS["current_a"]
-    odd = _odd_row(amps, -most, most, "a battery's current")
-    if odd[0]:
-        large = np.abs(amps) > most
-        are_few = amps.size > 1000 and np.mean(large) < LIMITS["odd_share"]
-        if not are_few and not all(map(_is_code, set(np.abs(amps[large])))):
-            peak = int(np.argmax(np.abs(amps)))
-            what = f"current exceeds {most:g} A in row {peak + 1}: it"
-            odd = _in_finer_unit(float(amps[peak]), most, "amperes", what)
-    return [*_wrapped(log), odd]
-
-
-def _wrapped(log: Log) -> Iterator[_Hypothesis]:
-    found = wrapped_current(log.current_a, log.voltage_v)
+    found = wrapped_current(amps, log.voltage_v)
     if found is not None:
         wraps_at_a, bits, step_a = found
-        field = f"{bits} bits unsigned of {step_a:g} A"
-        problem = f"the current wraps at {wraps_at_a:.10g} A ({field}): {WRAPPED}"
+        bit_field = f"{bits} bits unsigned of {step_a:g} A"
+        problem = f"the current wraps at {wraps_at_a:.10g} A ({bit_field}): {WRAPPED}"
         cure = f"read it as signed: {wraps_at_a:.10g} A less, from half of that on"
-        yield True, log.current_a[np.argmax(np.abs(log.current_a))], problem, cure, []
+        yield amps[np.argmax(np.abs(amps))], problem, cure, []
+    for odd in _odd_row(amps, -most, most, "a battery's current"):
+        size = np.abs(amps)
+        is_large = size > most
+        are_few = amps.size > 1000 and np.mean(is_large) < LIMITS["odd_share"]
+        if not are_few and not all(map(_is_code, set(size[is_large]))):
+            row = int(np.argmax(size))
+            what = f"current exceeds {most:g} A in row {row + 1}: it"
+            yield _in_finer_unit(float(amps[row]), most, "amperes", what)
+        yield odd
 
 
 def _is_code(value: float) -> bool:
@@ -344,43 +316,31 @@ def _is_code(value: float) -> bool:
     return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
 
 
-def _of_soc(soc_pct: FloatArray | None, *, is_stated: bool) -> list[_Hypothesis]:
+def _of_soc(soc_pct: FloatArray | None, *, is_stated: bool) -> Iterator[_Doubt]:
     if soc_pct is None or not np.isfinite(soc_pct).any():
-        return []
+        return
     least, most = float(np.nanmin(soc_pct)), float(np.nanmax(soc_pct))
-    is_share = least >= 0.0 and 0.0 < most <= 1.0 and not is_stated
+    if least >= 0.0 and 0.0 < most <= 1.0 and not is_stated:
+        cure = "multiply it by 100 (or leave it out if it stays below 1 %)"
+        yield most, "SoC looks like a fraction of 1", cure, ["-", "%"]
     odd = most if most > 110.0 else least
-    row = int(np.argmax(soc_pct == odd)) + 1
-    return [
-        (
-            is_share,
-            most,
-            "SoC looks like a fraction of 1",
-            "multiply it by 100 (or leave it out if it stays below 1 %)",
-            ["-", "%"],
-        ),
-        (
-            not -10.0 <= odd <= 110.0,
-            odd,
-            f"SoC of row {row} is not within 0–100 %",
-            "convert it to %",
-            [],
-        ),
-    ]
+    if not -10.0 <= odd <= 110.0:
+        row = int(np.argmax(soc_pct == odd)) + 1
+        yield odd, f"SoC of row {row} is not within 0–100 %", "convert it to %", []
 
 
-def _odd_row(values: FloatArray, least: float, most: float, kind: str) -> _Hypothesis:
-    """Return that a single row, the first, is impossible."""
-    is_odd = bool(values.min() < least or values.max() > most)
-    row = int(np.argmax((values < least) | (values > most))) if is_odd else 0
-    cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
-    return is_odd, float(values[row]), f"row {row + 1} is not {kind}", cure, []
+def _odd_row(values: FloatArray, least: float, most: float, kind: str) -> Iterator[_Doubt]:
+    """Yield the first row with an impossible value."""
+    if values.min() < least or values.max() > most:
+        row = int(np.argmax((values < least) | (values > most)))
+        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
+        yield float(values[row]), f"row {row + 1} is not {kind}", cure, []
 
 
-def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Hypothesis:
-    """Return that a value above a limit [V or A] is in milli or micro."""
+def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Doubt:
+    """Return the doubt that a value above a limit [V or A] is in milli or micro."""
     prefix, divisor, symbol = "milli", "1000", "m"
     if abs(value) > 1e3 * limit:
         prefix, divisor, symbol = "micro", "1,000,000", "u"
-    problem, cure = f"{what} looks like {prefix}{unit}", f"divide it by {divisor}"
-    return abs(value) > limit, value, problem, cure, [f"{symbol}{unit[0].upper()}"]
+    problem = f"{what} looks like {prefix}{unit}"
+    return value, problem, f"divide it by {divisor}", [f"{symbol}{unit[0].upper()}"]
