@@ -105,3 +105,12 @@ def test_a_log_that_is_its_own_reference_or_too_short_is_refused(
     write_log(drive(21, 80.0).rows(slice(0, 60)), tmp_path / "stub.csv")
     ran = in_process("gap", tmp_path / "stub.csv", "-m", made / "model.json")
     refused(ran, "too short for a diagnosis")
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_a_log_is_read(
+    made: Path, tmp_path: Path
+) -> None:
+    given = ("gap", tmp_path / "missing.csv", "-m", made / "model.json", "--extended")
+    refused(in_process(*given, tmp_path / f"{'a' * 250}.json"), "the file name is too long")
+    refused(in_process(*given, tmp_path / "nowhere" / "better.json"), "does not exist")
+    refused(in_process(*given, "/proc/better.json"), "error: ")

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from cangauge._typing import FloatArray
     from cangauge.diagnosis import Diagnosis
     from cangauge.logs.log import Log
+    from cangauge.model.model_file import Model
 
 
 @command()
@@ -142,27 +143,20 @@ def gap_command(
     --reference good2.csv --reference good3.csv`
     """
     from cangauge.diagnosis import diagnose
-    from cangauge.identify.starts import with_start
-    from cangauge.model.model_file import Model
 
-    added, healthy = list(add_test or []), list(reference or [])
-    paths = [*logs, *added]
-    model_file = None if model is None else Model.load(model)
-    if model_file is not None and capacity_ah is not None:
-        model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
-    check_outputs([report, extended], [*paths, *healthy, *([model] if model else [])])
+    tests, healthy = add_test or [], reference or []
+    given = _model_of(model, capacity_ah)
+    check_outputs([report, extended], filter(None, [*logs, *tests, *healthy, model]))
     with progress("cangauge.diagnosis") as show:
-        read = reading.load_all([*paths, *healthy], show, [simulated] if simulated else [])
-        if model_file is not None:
-            capacity_ah = model_file.capacity_ah
+        read = reading.load_all([*logs, *tests, *healthy], show, [simulated] if simulated else [])
+        if given is not None:
+            capacity_ah = given.capacity_ah
             _note_differences(read, capacity_ah)
-        own, references = read[: len(logs)], read[len(paths) :]
-        if initial_soc is not None:  # an added test has its own start
-            note_starts(own, initial_soc, capacity_ah)
-            own = [with_start(log, initial_soc) for log in own]
+        own = _started(read[: len(logs)], initial_soc, capacity_ah)
+        added, references = read[len(logs) :][: len(tests)], read[len(logs) + len(tests) :]
         found = diagnose(
-            [*own, *read[len(logs) : len(paths)]],
-            model_file,
+            [*own, *added],
+            given,
             references,
             simulation=_simulation(simulated, simulator, read, reading),
             capacity_ah=capacity_ah,
@@ -170,23 +164,58 @@ def gap_command(
         )
         before = None
         if added:
-            before = diagnose(found.logs[: len(logs)], found.model, found.healthy, alarm=alarm)
-    texts = {}
+            before = diagnose(found.logs[: len(own)], found.model, found.healthy, alarm=alarm)
     if extended is not None:
-        # Before anything is computed: a copy knows nothing of what its original computed.
         found = replace(found, correction_path=str(extended))
-        if found.is_written:
-            texts[extended] = found.extended_model.to_json()
+    written = _write(found, extended, report, model)
+    result = found.to_json() | {"assumed": assumed_of(read)}
+    if before is not None:
+        result["added_test"] = _added_test(added, before)
+    finish(result, partial(_show, found, before, plan, written), as_json=json_output)
+
+
+def _model_of(path: Path | None, capacity_ah: float | None) -> Model | None:
+    """Return the model in a file, with another capacity [Ah] where one is given."""
+    from cangauge.model.model_file import Model
+
+    if path is None:
+        return None
+    model = Model.load(path)
+    if capacity_ah is None:
+        return model
+    return model.model_copy(update={"capacity_ah": capacity_ah})
+
+
+def _started(logs: list[Log], initial_soc: float | None, capacity_ah: float | None) -> list[Log]:
+    """Return the logs with a SoC at their first row [%], if one is given."""
+    from cangauge.identify.starts import with_start
+
+    if initial_soc is None:
+        return logs
+    note_starts(logs, initial_soc, capacity_ah)
+    return [with_start(log, initial_soc) for log in logs]
+
+
+def _write(
+    found: Diagnosis, extended: Path | None, report: Path | None, model: Path | None
+) -> list[Path]:
+    """Write the corrected model, if there is one, and the page, both or none; return their paths.
+
+    The page names the file of the model.
+    """
+    texts = {}
+    if extended is not None and found.is_written:
+        texts[extended] = found.extended_model.to_json()
     if report is not None:
         texts[report] = extra("report.diagnosis:gap_page")(found, model).html()
     write_texts_atomic(texts)
-    result = found.to_json()
-    result["assumed"] = assumed_of(read)
-    if before is not None:
-        names = [log.name for log in read[len(logs) : len(paths)]]
-        probabilities = {"none": before.posterior.none, **before.posterior.faults}
-        result["added_test"] = {"logs": names, "before": probabilities}
-    finish(result, partial(_show, found, before, plan, texts), as_json=json_output)
+    return list(texts)
+
+
+def _added_test(logs: list[Log], before: Diagnosis) -> dict[str, Any]:
+    """Return the names of the logs of a test, and the probabilities without them, for JSON."""
+    probabilities = {"none": before.posterior.none, **before.posterior.faults}
+    return {"logs": [log.name for log in logs], "before": probabilities}
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
