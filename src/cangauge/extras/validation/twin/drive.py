@@ -101,13 +101,52 @@ def draw_drive(
     """
     hours = float(rng.uniform(0.5, 2.5)) if hours is None else hours
     ambient_c = float(rng.uniform(-10.0, 35.0)) if ambient_c is None else ambient_c
+    start, end = _draw_ends(rng, start_soc_pct, end_soc_pct)
+    _check(hours, ambient_c, start, end)
+    seconds = int(hours * 3600.0)
+    speed = _draw_speed(rng, seconds) if speed_ms is None else _given(speed_ms, seconds)
+    is_free = speed_ms is None and not discharge
+    if is_free:
+        _park(rng, speed)
+    power = _battery_power(rng, speed, _auxiliary_w(rng, ambient_c))
+    if pack.energy_kwh < 15.0:  # a smaller car than that of 38 kWh which the road load describes
+        power *= pack.energy_kwh / 38.0
+    if discharge:
+        wanted = (start - end) * pack.energy_kwh * 3.6e6
+        power *= 1.03 * wanted / max(float(np.sum(power)), 0.2 * wanted)
+    current, step_s = _current(rng, pack, power, start)
+    if is_free and rng.random() < 0.25:
+        current = _with_charging(rng, pack, current, step_s, start)
+    current = current[: _rows_until(end, start, current, step_s, pack.capacity_ah)]
+    time_s: FloatArray = np.arange(current.size, dtype=np.float64) * step_s
+    is_conditioned = rng.random() < 0.45 and not discharge
+    return Drive(
+        time_s=time_s,
+        current_a=current,
+        ambient_c=_weather(rng, time_s, ambient_c),
+        start_c=ambient_c + float(rng.normal(1.5, 2.0)),
+        start_soc=start,
+        conditioning_w=float(pack.energy_kwh * rng.uniform(25.0, 130.0)) if is_conditioned else 0.0,
+        target_c=float(rng.uniform(14.0, 26.0)),
+        history=float(rng.choice((-1.0, -1.0, rng.uniform(-1.0, 1.0), 1.0))),
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def _draw_ends(
+    rng: np.random.Generator, start_soc_pct: float | None, end_soc_pct: float | None
+) -> tuple[float, float]:
+    """Return the SoC at the start and at the end [-]: as given, else drawn."""
     start = 1.0 - 0.55 * float(rng.beta(1.0, 1.6))
     if start_soc_pct is not None:
         start = start_soc_pct / 100.0
-    if end_soc_pct is None:
-        end = min(float(rng.uniform(0.05, 0.20)), 0.6 * start)
-    else:
-        end = end_soc_pct / 100.0
+    if end_soc_pct is not None:
+        return start, end_soc_pct / 100.0
+    return start, min(float(rng.uniform(0.05, 0.20)), 0.6 * start)
+
+
+def _check(hours: float, ambient_c: float, start: float, end: float) -> None:
+    """Raise InputError for a drive out of range, or one that ends where it starts."""
     for name, value, low, high, unit in (
         ("hours", hours, 0.05, 12.0, "h"),
         ("ambient", ambient_c, -30.0, 50.0, "°C"),
@@ -120,40 +159,17 @@ def draw_drive(
         problem = f"the drive starts at {100.0 * start:g} %, at or below its end"
         cure = "give a lower end or a higher start"
         raise InputError(problem, field="end SoC", value=100.0 * end, cure=cure)
-    seconds = int(hours * 3600.0)
-    speed = _draw_speed(rng, seconds) if speed_ms is None else _given(speed_ms, seconds)
-    is_free = speed_ms is None and not discharge
-    if is_free:
-        _park(rng, speed)
-    # Auxiliary power, with a cabin heater in the cold.
-    heater_w = max(0.0, 18.0 - ambient_c) * float(rng.uniform(20.0, 110.0))
-    power = _battery_power(rng, speed, float(rng.uniform(250.0, 900.0)) + heater_w)
-    if pack.energy_kwh < 15.0:  # a smaller car than that of 38 kWh which the road load describes
-        power *= pack.energy_kwh / 38.0
-    if discharge:
-        wanted = (start - end) * pack.energy_kwh * 3.6e6
-        power *= 1.03 * wanted / max(float(np.sum(power)), 0.2 * wanted)
-    current, step_s = _current(rng, pack, power, start)
-    if is_free and rng.random() < 0.25:
-        current = _with_charging(rng, pack, current, step_s, start)
+
+
+def _rows_until(
+    end: float, start: float, current: FloatArray, step_s: float, capacity_ah: float
+) -> int:
+    """Return the rows of a current until a SoC [-], at least those of two minutes."""
     middle = 0.5 * (current[1:] + current[:-1])
-    left = start - np.append(0.0, np.cumsum(middle)) * step_s / 3600.0 / pack.capacity_ah
+    left = start - np.append(0.0, np.cumsum(middle)) * step_s / 3600.0 / capacity_ah
     empty = np.flatnonzero(left < end)
     rows = int(empty[0]) if empty.size else current.size
-    rows = max(rows, min(current.size, int(120.0 / step_s)))
-    time_s: FloatArray = np.arange(rows, dtype=np.float64) * step_s
-    is_conditioned = rng.random() < 0.45 and not discharge
-    return Drive(
-        time_s=time_s,
-        current_a=current[:rows],
-        ambient_c=_weather(rng, time_s, ambient_c),
-        start_c=ambient_c + float(rng.normal(1.5, 2.0)),
-        start_soc=start,
-        conditioning_w=float(pack.energy_kwh * rng.uniform(25.0, 130.0)) if is_conditioned else 0.0,
-        target_c=float(rng.uniform(14.0, 26.0)),
-        history=float(rng.choice((-1.0, -1.0, rng.uniform(-1.0, 1.0), 1.0))),
-        seed=int(rng.integers(2**31)),
-    )
+    return max(rows, min(current.size, int(120.0 / step_s)))
 
 
 # --- Speed
@@ -225,6 +241,12 @@ def _smooth(rng: np.random.Generator, rows: int, sigma: float) -> FloatArray:
     """Draw a fluctuation of some rows' correlation, of standard deviation 1."""
     drawn = gaussian_filter1d(rng.normal(size=rows), sigma, mode="nearest")
     return np.asarray(drawn / max(float(np.std(drawn)), 1e-9))
+
+
+def _auxiliary_w(rng: np.random.Generator, ambient_c: float) -> float:
+    """Draw the auxiliary power [W], with a cabin heater in the cold."""
+    heater_w = max(0.0, 18.0 - ambient_c) * float(rng.uniform(20.0, 110.0))
+    return float(rng.uniform(250.0, 900.0)) + heater_w
 
 
 def _battery_power(rng: np.random.Generator, speed: FloatArray, auxiliary_w: float) -> FloatArray:

@@ -118,6 +118,36 @@ def fit_surrogate_pack(
     InputError
         For a log without a SoC.
     """
+    curve_v, pack_ohm = _curve_and_resistance(logs, capacity_ah)
+    ohm = pack_ohm / cells
+    energy_kwh = cells * 3.7 * capacity_ah / 1000.0
+    heat_j_k = energy_kwh * 7000.0
+    first = logs[0]
+    return TwinPack(
+        **TYPICAL,
+        name=name,
+        chemistry=CellChemistry.tabulated(name, _KNOTS, curve_v / cells, 0.0, "nmc"),
+        cells=cells,
+        capacity_ah=capacity_ah,
+        groups=np.array([[float(cells)], [1.0], [1.0], [0.0]]),
+        ohmic_ohm=0.55 * ohm,
+        busbar_ohm=0.05 * pack_ohm,
+        exchange_a=THERMAL_V / (0.40 * ohm),
+        electrolyte_ohm=(0.08 * ohm, 0.07 * ohm),
+        solid_swing=(0.012 / capacity_ah, 0.005 / capacity_ah, 0.003 / capacity_ah),
+        core_j_k=0.75 * heat_j_k,
+        surface_j_k=0.25 * heat_j_k,
+        core_surface_w_k=energy_kwh * 7.0,
+        surface_ambient_w_k=heat_j_k / 18000.0,
+        sensors=Sensors(*map(_resolution, (first.current_a, first.voltage_v, first.temperature_c))),
+    )
+
+
+def _curve_and_resistance(logs: Sequence[Log], capacity_ah: float) -> tuple[FloatArray, float]:
+    """Return a pack's open-circuit voltage at `_KNOTS` [V], and its resistance within 20 s [Ω].
+
+    Least squares at 1 Hz on a piecewise linear curve, the current, and its lags.
+    """
     rows, volts = [], []
     for log in logs:
         time_s = np.arange(log.time_s[0], log.time_s[-1])
@@ -134,30 +164,9 @@ def fit_surrogate_pack(
     solution, *_ = np.linalg.lstsq(
         np.vstack([*rows, bends]), np.concatenate([voltage_v, np.zeros(len(bends))])
     )
-    curve_v = isotonic_regression(solution[: _KNOTS.size]).x / cells
-    pack_ohm = max(float(np.sum(solution[_KNOTS.size : -1])), 1e-4)
-    ohm = pack_ohm / cells
-    energy_kwh = cells * 3.7 * capacity_ah / 1000.0
-    heat_j_k = energy_kwh * 7000.0
-    first = logs[0]
-    return TwinPack(
-        **TYPICAL,
-        name=name,
-        chemistry=CellChemistry.tabulated(name, _KNOTS, curve_v, 0.0, "nmc"),
-        cells=cells,
-        capacity_ah=capacity_ah,
-        groups=np.array([[float(cells)], [1.0], [1.0], [0.0]]),
-        ohmic_ohm=0.55 * ohm,
-        busbar_ohm=0.05 * pack_ohm,
-        exchange_a=THERMAL_V / (0.40 * ohm),
-        electrolyte_ohm=(0.08 * ohm, 0.07 * ohm),
-        solid_swing=(0.012 / capacity_ah, 0.005 / capacity_ah, 0.003 / capacity_ah),
-        core_j_k=0.75 * heat_j_k,
-        surface_j_k=0.25 * heat_j_k,
-        core_surface_w_k=energy_kwh * 7.0,
-        surface_ambient_w_k=heat_j_k / 18000.0,
-        sensors=Sensors(*map(_resolution, (first.current_a, first.voltage_v, first.temperature_c))),
-    )
+    curve_v: FloatArray = isotonic_regression(solution[: _KNOTS.size]).x
+    # The slower lag is diffusion, which the surrogate has besides.
+    return curve_v, max(float(np.sum(solution[_KNOTS.size : -1])), 1e-4)
 
 
 def _resolution(values: FloatArray) -> float:

@@ -271,13 +271,9 @@ def draw_pack(
     InputError
         For an unknown kind or chemistry.
     """
-    kinds = _TABLE["kinds"]
-    if kind is None:
-        kind = pick(rng, {name: each["odds"] for name, each in kinds.items()})
-    if kind not in kinds:
-        raise InputError("unknown pack", value=kind, cure=f"use {', '.join(KINDS)}")
-    cells, capacity_ah = kinds[kind]["cells"], rng.uniform(*kinds[kind]["capacity_ah"])
-    usual = pick(rng, kinds[kind]["chemistry"])
+    kind, table = _draw_kind(rng, kind)
+    cells, capacity_ah = table["cells"], rng.uniform(*table["capacity_ah"])
+    usual = pick(rng, table["chemistry"])
     entropy = float(np.exp(rng.uniform(-0.2, 1.1)))
     cell = chemistry(chemistry_name or usual, rng)
     # Overpotential of one cell at 1C, divided among the processes.
@@ -290,20 +286,12 @@ def draw_pack(
     swing = rng.uniform(0.012, 0.030) / capacity_ah
     energy_kwh = cells * 3.7 * capacity_ah / 1000.0
     heat_j_k = energy_kwh * rng.uniform(5500.0, 8500.0)
-    quantiles = np.array([-1.75, -0.85, 0.0, 0.85, 1.75])  # of the cell spread, for the groups
     return TwinPack(
         name=kind,
         chemistry=replace(cell, entropy_table_v_k=entropy * cell.entropy_table_v_k),
         cells=cells,
         capacity_ah=capacity_ah,
-        groups=np.array(
-            [
-                np.array([0.1, 0.2, 0.4, 0.2, 0.1]) * cells,
-                1.0 + rng.uniform(0.003, 0.012) * rng.permutation(quantiles),
-                1.0 + rng.uniform(0.01, 0.05) * rng.permutation(quantiles),
-                rng.uniform(0.001, 0.006) * rng.permutation(quantiles),
-            ]
-        ),
+        groups=_draw_groups(rng, cells),
         ohmic_ohm=ohmic,
         ohmic_vogel_k=rng.uniform(150.0, 320.0),
         busbar_ohm=cells * ohmic * rng.uniform(0.03, 0.15),
@@ -321,4 +309,27 @@ def draw_pack(
         core_surface_w_k=energy_kwh * rng.uniform(4.0, 10.0),
         surface_ambient_w_k=heat_j_k / rng.uniform(9000.0, 30000.0),
         sensors=Sensors.draw(rng, cells * 3.7, capacity_ah),
+    )
+
+
+def _draw_kind(rng: np.random.Generator, kind: str | None) -> tuple[str, dict[str, Any]]:
+    """Return a kind of pack and its table, drawn by its odds where none is given."""
+    kinds = _TABLE["kinds"]
+    if kind is None:
+        kind = pick(rng, {name: each["odds"] for name, each in kinds.items()})
+    if kind not in kinds:
+        raise InputError("unknown pack", value=kind, cure=f"use {', '.join(KINDS)}")
+    return kind, kinds[kind]
+
+
+def _draw_groups(rng: np.random.Generator, cells: int) -> FloatArray:
+    """Draw `groups` of a healthy pack, shape (4, 5): the quantiles of each spread, shuffled."""
+    quantiles = np.array([-1.75, -0.85, 0.0, 0.85, 1.75])
+    return np.array(
+        [
+            np.array([0.1, 0.2, 0.4, 0.2, 0.1]) * cells,
+            1.0 + rng.uniform(0.003, 0.012) * rng.permutation(quantiles),
+            1.0 + rng.uniform(0.01, 0.05) * rng.permutation(quantiles),
+            rng.uniform(0.001, 0.006) * rng.permutation(quantiles),
+        ]
     )

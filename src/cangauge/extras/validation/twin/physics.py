@@ -104,22 +104,18 @@ def respond(
     pack: TwinPack, drive: Drive, faults: Faults, core_c: FloatArray, surface_c: FloatArray
 ) -> Response:
     """Return the response to the current of a drive at known temperatures [°C], shape (n,)."""
-    T, cell, time_s = core_c + KELVIN, pack.chemistry, drive.time_s
-    I = drive.current_a
-    if (load := faults.get("parasitic_switching")) is not None:
-        I = I + load.size * load.is_active(time_s)
-    cells, capacity, resistance, shift = _groups(pack, faults)
-    counted = np.where(I < 0.0, (1.0 - size_of(faults, "coulombic_efficiency")) * I, I)
-    integral = np.append(0.0, np.cumsum(0.5 * (counted[1:] + counted[:-1]))) * drive.step_s
-    drawn = integral / 3600.0 / pack.capacity_ah
+    T, cell = core_c + KELVIN, pack.chemistry
+    I = _cell_current(drive, faults)
+    drawn = _drawn(pack, drive, faults, I)
     start = drive.start_soc + size_of(faults, "initial_soc") / 100.0
+    cells, capacity, resistance, shift = _groups(pack, faults)
     z = (start + shift)[:, None] - drawn / capacity[:, None]
 
-    electrolyte_v, reacting_a, swing = _relaxed(pack, drive, I, T)
     dU_dT = cell.entropy(z) + _entropy_change(faults, z)
     reversible = dU_dT * (T - T0_K)
     U0 = cell.ocv(z) + reversible
 
+    electrolyte_v, reacting_a, swing = _relaxed(pack, drive, I, T)
     # This fault diverges at 230 K.
     stiff = np.exp(size_of(faults, "resistance_temperature") * _over(T, 230.0))
     eta = _kinetics(pack, z, reacting_a, T, stiff * (1.0 + size_of(faults, "charge_transfer")))
@@ -130,7 +126,7 @@ def respond(
 
     drop = cells @ eta + pack.busbar_ohm * I
     if (dropout := faults.get("string_dropout")) is not None:
-        drop = drop * (1.0 + dropout.size * dropout.is_active(time_s))
+        drop = drop * (1.0 + dropout.size * dropout.is_active(drive.time_s))
     drop = drop + _added_drop(drive, faults, I, T)
     open_v = cells @ U0
     empty = np.flatnonzero(np.min(U0 - eta, axis=0) < cell.empty_v)
@@ -144,6 +140,20 @@ def respond(
         surface_c=surface_c,
         rows=int(empty[0]) if empty.size else I.size,
     )
+
+
+def _cell_current(drive: Drive, faults: Faults) -> FloatArray:
+    """Return the current through the cells [A]: that of the car, and of a parasitic load."""
+    if (load := faults.get("parasitic_switching")) is None:
+        return drive.current_a
+    return drive.current_a + load.size * load.is_active(drive.time_s)
+
+
+def _drawn(pack: TwinPack, drive: Drive, faults: Faults, I: FloatArray) -> FloatArray:
+    """Return the charge drawn from the mean cell, relative to its healthy capacity [-]."""
+    counted = np.where(I < 0.0, (1.0 - size_of(faults, "coulombic_efficiency")) * I, I)
+    integral = np.append(0.0, np.cumsum(0.5 * (counted[1:] + counted[:-1]))) * drive.step_s
+    return np.asarray(integral / 3600.0 / pack.capacity_ah)
 
 
 # --- Cells
