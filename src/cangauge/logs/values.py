@@ -72,8 +72,8 @@ def read_cells(
 
     Null stands where there is no value, and where a restarted logger wrote its header again.
     Numbers are read as they are spelled (`−1'800,5 V`): what a mark means in one cell tells it in
-    all others of the table, but one in the columns `apart`, of times, not in the others: programs
-    write times as they do themselves. `decimal_mark` is that of a table of which no cell tells it.
+    all others of the table, but decimal points in the columns `apart`, of times: programs write
+    them beside decimal commas. `decimal_mark` is that of a table of which no cell tells it.
 
     Raises
     ------
@@ -153,7 +153,9 @@ def _with_decimal_points(
     numbers = {place: _numbers_among(cells) for place, cells in alike.items()}
     numbers = {place: cells for place, cells in numbers.items() if _any(cells, "[.,]")}
     own = {place: _decimal_marks(cells) for place, cells in numbers.items()}
-    of_table = set[str]().union(*(marks for place, marks in own.items() if place not in apart))
+    of_table = {
+        mark for place, marks in own.items() for mark in marks if mark == "," or place not in apart
+    }
     of_table = of_table or {*decimal_mark}
     for place, cells in numbers.items():
         decimal = own[place] if len(own[place]) == 1 else of_table
