@@ -265,14 +265,28 @@ def of_model(given: Model, stated_v: float) -> Healthy:
     model = with_all_loads(given.extended_model())
     tried = shapes(model.pack)
     covariance = stated_covariance(model, given)
-    delta = _prior_rows(np.zeros(len(covariance)), covariance, STRUCTURES[0], tried)
+    delta = _prior_rows((np.zeros(len(covariance)), covariance), 1.0, STRUCTURES[0], tried)
     return Healthy(model, tried, delta, max(stated_v, LEAST_NOISE * model.pack.voltage_v) ** 2)
 
 
 def _prior_rows(
-    mean: FloatArray, covariance: FloatArray, structure: float, tried: Sequence[Shape]
+    known: tuple[FloatArray, FloatArray], curve: float, structure: float, tried: Sequence[Shape]
 ) -> Rows:
-    """Return the rows of the prior of δ: coefficients, then a healthy pack's effects."""
+    """Return the rows of the prior of δ: coefficients, then a healthy pack's effects.
+
+    Parameters
+    ----------
+    known : (array of shape (p,), array of shape (p, p))
+        Mean and covariance of the coefficients.
+    curve : float
+        Standard deviation of the curve about its level, relative to the known one.
+    structure : float
+        That of a healthy pack's effects, relative to their bounds.
+    tried : sequence of Shape
+    """
+    mean, covariance = known[0], known[1].copy()
+    level = float(covariance[:N, :N].min())
+    covariance[:N, :N] = (covariance[:N, :N] - level) * curve**2 + level
     p, q = mean.size, _healthy_shapes(tried).size
     scale = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-9 * np.eye(p))
@@ -289,42 +303,53 @@ def corrected_by(
     """Return the healthy pack by references, their rows, and which of them can be judged.
 
     The model is corrected to the posterior mean of all references, with the prior of the fit. About
-    that model δ has its prior again. A reference can be left out and judged where the others visit
-    enough of its SoC.
+    that model δ has its prior again, now with the effects of a healthy pack.
     """
     model = with_all_loads(given.extended_model())
     logs = [log_rows(model, log, (), ()) for log in references]
     visited = [log.simulated.plain.soc_pct[log.trace.rows] for log in logs]
-    seconds = np.array([log.seconds for log in logs])
-    volts = [float(np.mean(log.log.voltage_v[log.rows])) for log in references]
-    mean_v, mean_soc = (
-        float(seconds @ each) / float(seconds.sum())
-        for each in (volts, [soc.mean() for soc in visited])
-    )
-    known = prior(model, given, mean_v, mean_soc)
-    healthy = Healthy(model, (), _prior_rows(*known, 1.0, ()), (FIRST_NOISE * mean_v) ** 2)
-    healthy = _tuned(healthy, logs, [len(logs) > 1] * len(logs), known, mean_v)
-    rows = total(healthy.delta, [healthy.rows_of(log) for log in logs])
-    model = corrected(model, rows.posterior().mean)
-    tried, around = shapes(model.pack), [visited[:k] + visited[k + 1 :] for k in range(len(logs))]
+    mean_v, mean_soc_pct = _means(logs, visited)
+
+    known = prior(model, given, mean_v, mean_soc_pct)
+    first = Healthy(model, (), _prior_rows(known, 1.0, 1.0, ()), (FIRST_NOISE * mean_v) ** 2)
+    least_v2 = (LEAST_NOISE * mean_v) ** 2
+    first = _tuned(first, logs, [len(logs) > 1] * len(logs), known, least_v2)
+    every = total(first.delta, [first.rows_of(log) for log in logs])
+
+    model = corrected(model, every.posterior().mean)
+    tried = shapes(model.pack)
+    around = [visited[:k] + visited[k + 1 :] for k in range(len(logs))]
     logs = [
         log_rows(model, log, tried, others) for log, others in zip(references, around, strict=True)
     ]
-    is_judged = [
-        bool(others and covered(soc, others).mean() >= LEAST_COVERED)
-        for soc, others in zip(visited, around, strict=True)
-    ]
-    known = prior(model, given, mean_v, mean_soc)
+    is_judged = [_is_covered(soc, others) for soc, others in zip(visited, around, strict=True)]
+    known = prior(model, given, mean_v, mean_soc_pct)
     healthy = Healthy(
         model,
         tried,
-        _prior_rows(*known, 1.0, tried),
-        healthy.s2,
+        _prior_rows(known, 1.0, 1.0, tried),
+        first.s2,
         tuple(references),
         tuple(visited),
         soc_ratio=_soc_ratio(logs),
     )
-    return _tuned(healthy, logs, is_judged, known, mean_v), logs, is_judged
+    return _tuned(healthy, logs, is_judged, known, least_v2), logs, is_judged
+
+
+def _means(logs: Sequence[LogRows], visited: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return mean voltage [V] and SoC [%] of logs, each weighed by its time."""
+    seconds = np.array([log.seconds for log in logs])
+    volts = [float(np.mean(log.trace.log.voltage_v[log.trace.rows])) for log in logs]
+    soc_pct = [soc.mean() for soc in visited]
+    mean_v, mean_soc_pct = (
+        float(seconds @ each) / float(seconds.sum()) for each in (volts, soc_pct)
+    )
+    return mean_v, mean_soc_pct
+
+
+def _is_covered(soc_pct: FloatArray, others: Sequence[FloatArray]) -> bool:
+    """Return whether other references visit enough of a reference's SoC to judge it."""
+    return bool(others and covered(soc_pct, others).mean() >= LEAST_COVERED)
 
 
 def _tuned(
@@ -332,44 +357,48 @@ def _tuned(
     logs: Sequence[LogRows],
     is_judged: Sequence[bool],
     known: tuple[FloatArray, FloatArray],
-    mean_v: float,
+    least_v2: float,
 ) -> Healthy:
     """Return the healthy pack with the prior and noise that predict left-out references best.
 
-    Twice, since the weight of the rows follows from the noise. `known` is the prior's mean and
-    covariance, before it is tuned.
+    Twice, since the weight of the rows follows from the noise, of `least_v2` at least [V²].
     """
-    mean, covariance = known
-    least_v2 = (LEAST_NOISE * mean_v) ** 2
     judged = [k for k, each in enumerate(is_judged) if each]
     for _ in range(2):
         every = [_gram(healthy.delta_rows_of(log)) for log in logs]
-        whole = np.sum(every, axis=0)
-        found: list[tuple[float, int, Rows, float]] = []
+        best, least = (healthy.delta, healthy.s2), np.inf
         for curve, structure in itertools.product(CURVES, STRUCTURES):
-            rows = _prior_rows(mean, _flatter(covariance, curve), structure, healthy.tried)
-            with_all, left = _gram(rows) + whole, []
-            for k in judged:
-                others = with_all - every[k]
-                delta = np.linalg.solve(others[:-1, :-1], others[:-1, -1])
-                left.append(healthy.square_v2(logs[k], delta) / logs[k].seconds)
-            loss = float(np.sum(np.log(np.add(left, least_v2))))
-            found.append((loss, len(found), rows, float(np.mean(left or healthy.s2))))
-        _, _, rows, noise_v2 = min(found)
+            rows = _prior_rows(known, curve, structure, healthy.tried)
+            left_v2 = _left_out_v2(healthy, logs, judged, _gram(rows), every)
+            loss = float(np.sum(np.log(np.add(left_v2, least_v2))))
+            if loss < least:
+                best, least = (rows, float(np.mean(left_v2 or healthy.s2))), loss
+        rows, noise_v2 = best
         healthy = replace(healthy, delta=rows, s2=max(noise_v2, least_v2))
     return healthy
 
 
+def _left_out_v2(
+    healthy: Healthy,
+    logs: Sequence[LogRows],
+    judged: Sequence[int],
+    of_prior: FloatArray,
+    every: Sequence[FloatArray],
+) -> list[float]:
+    """Return the mean square error of each judged log by the others [V²].
+
+    `of_prior` and `every` are the normal equations of the prior and of each log.
+    """
+    whole, left_v2 = of_prior + np.sum(every, axis=0), []
+    for k in judged:
+        others = whole - every[k]
+        delta = np.linalg.solve(others[:-1, :-1], others[:-1, -1])
+        left_v2.append(healthy.square_v2(logs[k], delta) / logs[k].seconds)
+    return left_v2
+
+
 def _gram(rows: Rows) -> FloatArray:
     return rows.table.T @ rows.table
-
-
-def _flatter(covariance: FloatArray, scale: float) -> FloatArray:
-    """Return a prior's covariance with a curve that differs less, at any level."""
-    level = float(covariance[:N, :N].min())
-    result = covariance.copy()
-    result[:N, :N] = (covariance[:N, :N] - level) * scale**2 + level
-    return result
 
 
 def _soc_ratio(logs: Sequence[LogRows]) -> tuple[float, float]:
