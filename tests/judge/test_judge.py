@@ -19,6 +19,7 @@ from cangauge.__main__ import main
 from cangauge.errors import InputError
 from cangauge.extras.judge import explain
 from cangauge.extras.judge.judgement import narrowed
+from cangauge.extras.judge.linearised import Linearised, Terms
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
 from cangauge.model.published import leaf_2012_model_file
@@ -509,7 +510,32 @@ def test_a_current_that_wraps_is_refused(pack: Pack) -> None:
         cangauge.judge([replace(logs[0], current_a=wrapped)], model)
 
 
-def linearised(pack: Pack, monkeypatch, *stds: float) -> explain.Linearised:
+@pytest.mark.parametrize("seed", range(6))
+def test_the_last_digit_does_not_move_the_answer(pack: Pack, seed: int) -> None:
+    model, _ = pack
+    rng = np.random.default_rng(seed)
+    time_s, minute = np.arange(0.0, 900.0), np.arange(900) // 60
+    amps = np.full(900, model.capacity_ah / rng.uniform(2.0, 6.0))
+    volts = float(model.voltage_model().pseudo_ocv([rng.uniform(3.0, 60.0)])[0])
+    volts *= 1.0 + rng.uniform(0.003, 0.02) * rng.choice([-1.0, 1.0], 15)[minute]
+    log = cangauge.Log(time_s, amps, volts, np.full(900, 25.0))
+    shown = rng.uniform(20.0, 100.0) - rng.uniform(0.5, 2.0) * 100.0 * drawn_ah(log) / (
+        model.capacity_ah
+    )
+    log = replace(log, soc_pct=shown)
+    answers = []
+    for shift_v in (0.0, 1e-9, -1e-9):
+        try:
+            answers.append(cangauge.judge([replace(log, voltage_v=volts + shift_v)], model))
+        except InputError:  # the log contradicts itself
+            continue
+    assert len(answers) in (0, 3)
+    for each in answers[1:]:
+        apart_pct = each.error_pct - answers[0].error_pct
+        assert abs(apart_pct) < 0.1 * answers[0].error_std_pct
+
+
+def linearised(pack: Pack, monkeypatch, *stds: float) -> Linearised:
     """Return the model of a log whose only faults are offsets of the current, of one shape."""
     seen = []
     monkeypatch.setattr(
@@ -517,13 +543,12 @@ def linearised(pack: Pack, monkeypatch, *stds: float) -> explain.Linearised:
         lambda *given: seen.append(given) or explain.explain(*given),
     )
     cangauge.judge(pack[1][:1], pack[0])
-    chain, known = seen[0]
-    offset = next(
-        each for each in explain.faults(chain, chain.fitting_pct) if each.fault == "current_offset"
-    )
+    terms = Terms(*seen[0])
+    offset = next(each for each in terms.columns if each.fault == "current_offset")
     alike = [replace(offset, std=std) for std in stds]
-    monkeypatch.setattr(explain, "faults", lambda *_: alike)
-    return explain.Linearised(chain, known, chain.fitting_pct)
+    monkeypatch.setattr("cangauge.extras.judge.linearised.faults", lambda _: alike)
+    terms = Terms(*seen[0])
+    return Linearised(terms, np.zeros(len(terms.columns)))
 
 
 def test_what_no_log_tells_apart_keeps_its_prior(pack: Pack, monkeypatch) -> None:

@@ -3,6 +3,7 @@
 gauge      what the gauge published: counts, limits, stands and jumps
 chain      logs of several days as stretches of blocks
 faults     what may be wrong, as columns of a linear model; its table is faults.toml
+linearised the linear model of all logs, at given coefficients
 explain    which sets of faults explain the logs, each with its probability
 weak       a weak cell, from the cell voltages
 judgement  all of it as one judgement

@@ -181,6 +181,14 @@ class Chain:
         """Return the slope of the voltage over the SoC at each block, over 2 % of it [V/%]."""
         return 0.5 * (self.voltage_v(soc_pct + 1.0) - self.voltage_v(soc_pct - 1.0))
 
+    def tangent(self, soc_pct: FloatArray, of_functions: FloatArray) -> FloatArray:
+        """Return the derivative of the voltage, with a multiple of each function [V/%]."""
+        low, high = (
+            self.voltage_v(at) + self.function_columns(at) @ of_functions
+            for at in (soc_pct - 0.1, soc_pct + 0.1)
+        )
+        return (high - low) / 0.2
+
     def function_columns(self, soc_pct: FloatArray) -> FloatArray:
         """Return what the principal functions add to the voltage [V], shape (blocks, functions)."""
         curve = hermite_basis(soc_pct, np.array(self.functions.soc_pct)) @ self.functions.value

@@ -64,6 +64,9 @@ class Column:
         Of a level; −1 otherwise.
     log_prior : float
         Log of the prior probability relative to none.
+    right_at : array of shape (blocks,), or float, optional
+        Of an error of scale: the block, or the SoC [%], at which the gauge is right. A unit adds
+        1 % of the distance from there to `shown`.
     """
 
     std: float
@@ -74,6 +77,7 @@ class Column:
     since: int = 0
     piece: int = -1
     log_prior: float = 0.0
+    right_at: IntArray | float | None = None
 
     @property
     def name(self) -> tuple[str, int, int]:
@@ -86,15 +90,16 @@ class Column:
         return FAULTS[self.fault].place, *self.name[1:]
 
 
-def healthy(chain: Chain, known: Mapping[str, float], soc_pct: FloatArray) -> list[Column]:
+def healthy(chain: Chain, known: Mapping[str, float]) -> list[Column]:
     """Return what a healthy pack and gauge show; first the principal functions, then the zero.
 
-    `known` holds the standard deviations of zero, voltage and capacity [%].
+    `known` holds the standard deviations of zero, voltage and capacity [%]. What the functions add
+    to the voltage depends on the SoC.
     """
     offset_pct, offset_v = chain.sensor("current_offset")
     stretches = [chain.blocks.stretch == k for k in range(len(chain.stretches))]
     return [
-        *(Column(1.0, volts=each) for each in chain.function_columns(soc_pct).T),
+        *(Column(1.0) for _ in range(chain.functions.number)),
         Column(known["zero"], shown=1.0),
         *(Column(60.0, each, each) for each in stretches),  # the SoC at its start is unknown
         # A model is off in the same way on days that are alike: as much as from log to log.
@@ -106,12 +111,12 @@ def healthy(chain: Chain, known: Mapping[str, float], soc_pct: FloatArray) -> li
     ]
 
 
-def faults(chain: Chain, soc_pct: FloatArray) -> list[Column]:
+def faults(chain: Chain) -> list[Column]:
     """Return everything that may be wrong, in all its shapes, with their prior probabilities."""
     pieces = _pieces(chain)
     families = [(list(_levels(chain, n)), FAULTS["start_or_reset"].probability) for n in pieces]
     families.append(([each for n in pieces for each in _levels_in_pauses(chain, n)], P_FAULT))
-    others = [*_offsets(chain), *_counts(chain, soc_pct), *_of_voltage(chain, soc_pct)]
+    others = [*_offsets(chain), *_counts(chain), *_of_voltage(chain)]
     for name in dict.fromkeys(each.fault for each in others):
         of_name = [each for each in others if each.fault == name]
         families.append((of_name, FAULTS[name].probability))
@@ -208,31 +213,32 @@ def _offsets(chain: Chain) -> Iterator[Column]:
                 )
 
 
-def _counts(chain: Chain, soc_pct: FloatArray) -> Iterator[Column]:
+def _counts(chain: Chain) -> Iterator[Column]:
     """Yield wrong scales of the count, other capacities of the pack, and lags.
 
     The gauge is right when a piece begins, when it is full, or when it is empty; or its error is of
     each log alone.
     """
     (std,), (soc, volts) = FAULTS["count_scale"].stds, chain.sensor("capacity")
-    begin, in_stretch = _begins(chain.piece), _begins(_in_stretches(chain))
-    for right_pct in (soc_pct[begin], 100.0, 0.0, soc_pct[in_stretch]):
-        error = (soc_pct - right_pct) / 100.0
-        yield Column(std, shown=error, fault="count_scale")
-        yield Column(std, soc, error + soc, volts, "pack_capacity")
+    for right_at in (_begins(chain.piece), 100.0, 0.0, _begins(_in_stretches(chain))):
+        yield Column(std, fault="count_scale", right_at=right_at)
+        yield Column(std, soc, soc, volts, "pack_capacity", right_at=right_at)
     yield Column(std, soc, soc, fault="model_capacity")
     for late_s in FAULTS["late"].stds:
         behind_pct = chain.blocks.drawn_pct - chain.drawn_before(late_s)
         yield Column(late_s, shown=behind_pct / late_s, fault="late")
 
 
-def _of_voltage(chain: Chain, soc_pct: FloatArray) -> Iterator[Column]:
-    """Yield a wrong voltage of the log, and a gauge that reads a table of voltages under load."""
+def _of_voltage(chain: Chain) -> Iterator[Column]:
+    """Yield a wrong voltage of the log, and a gauge that reads a table of voltages under load.
+
+    Such a gauge is at the SoC at which the voltage fits.
+    """
     (std,), (_, volts) = FAULTS["voltage_sensor"].stds, chain.sensor("voltage_gain")
     for since, is_after in _onsets(chain):
         yield Column(std, volts=volts * is_after, fault="voltage_sensor", since=since)
     (std,) = FAULTS["voltage_table"].stds
     # Where the curve is flat, a tenth of its mean slope.
     least = 0.1 * float(np.ptp(chain.extended.model.pseudo_ocv([5.0, 95.0]))) / 90.0
-    read_pct = chain.blocks.load_v / np.maximum(chain.slope(soc_pct), least)
+    read_pct = chain.blocks.load_v / np.maximum(chain.slope(chain.fitting_pct), least)
     yield Column(std, shown=read_pct, fault="voltage_table")

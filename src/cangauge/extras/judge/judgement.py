@@ -16,9 +16,10 @@ from cangauge._typing import FloatArray
 from cangauge.diagnosis.checks import check_given_once
 from cangauge.errors import InputError
 from cangauge.extras.judge.chain import Chain
-from cangauge.extras.judge.explain import BEYOND, Fitted, explain
+from cangauge.extras.judge.explain import explain
 from cangauge.extras.judge.faults import FAULTS, Column
 from cangauge.extras.judge.gauge import JUMP_PCT, STAND_PCT, is_limit, published_pct, stands
+from cangauge.extras.judge.linearised import BEYOND, Fitted
 from cangauge.extras.judge.result import FoundFault, Judgement, Moment, Piece, Verdict, is_dated
 from cangauge.extras.judge.text import AGREES_PCT, NAMED, OFF_PCT, SURE
 from cangauge.extras.judge.weak import weakest_cell
@@ -283,13 +284,15 @@ def _faults(chain: Chain, fits: Sequence[Fitted]) -> list[FoundFault]:
     for of_name in shapes.values():
         share, sizes, stds = np.array([numbers for *numbers, _ in of_name]).T
         probability, column = float(share.sum()), of_name[int(np.argmax(share))][-1]
+        if probability < NAMED:
+            continue
         size = float(share @ sizes) / probability
         std = float(np.sqrt(share @ (stds**2 + (sizes - size) ** 2) / probability))
         # Without a trace in what is published: of the log or the model, and not of the gauge.
         apart = np.broadcast_to(np.asarray(column.shown) - column.soc, chain.piece.shape)
         moves = float(np.abs(apart[chain.piece >= 0]).max(initial=0.0))
         matters = moves == 0.0 or abs(size) * moves >= STAND_PCT
-        is_sure = probability >= NAMED and SURE * std < abs(size) <= BEYOND * column.std
+        is_sure = SURE * std < abs(size) <= BEYOND * column.std
         if not is_sure or not matters:
             continue
         is_inside = chain.samples.stretch >= column.since

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from cangauge._typing import FloatArray
-from cangauge.extras.judge.explain import Fitted
 from cangauge.extras.judge.faults import FAULTS
 from cangauge.extras.judge.gauge import published_pct
+from cangauge.extras.judge.linearised import Fitted
 from cangauge.extras.judge.text import EPOCH_S, SURE, lines_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
