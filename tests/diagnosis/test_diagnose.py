@@ -180,7 +180,9 @@ def test_a_model_with_a_wrong_level_is_told_first(references: list[Log], model: 
     assert "compared with the model, the pack voltage reads" in found.summary
     assert "with the model corrected" in found.summary
     assert found.extended_rmse_v < 0.3 * found.baseline_rmse_v
-    assert judged(found, initial_soc=1.0).why_not is None
+    start = judged(found, initial_soc=1.0)
+    assert start.why_not is None
+    assert "does not correct the fault of these logs: a wrong start belongs to" in start.summary
 
 
 def test_two_errors_of_a_model_that_cancel_are_both_told(

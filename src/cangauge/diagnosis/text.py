@@ -229,9 +229,11 @@ def _to_do(found: Diagnosis) -> str:
         return f"{found.check_first}{_would_have_shown(found)}"
     model = "--extended FILE.json saves the corrected model (in Python: `extended_model.save`)."
     if found.why_not is not None:
-        model = f"No correction: {found.why_not}."
-    elif found.correction_path:
+        return f"{found.check_first} No correction: {found.why_not}."
+    if found.correction_path:
         model = f"Corrected model: {found.correction_path}"
+    if refusal := _refusal(found):  # the model is corrected for the healthy logs alone
+        model += f"\nIt does not correct the fault of these logs: {refusal}."
     return f"{found.check_first} {model}"
 
 
@@ -270,19 +272,27 @@ def why_not(found: Diagnosis) -> str | None:
     """Return why there is no correction to write; None where there is one."""
     if found.is_written:
         return None
+    if not found.posterior.stated:
+        return "no fault is stated"
+    return _refusal(found)
+
+
+def _refusal(found: Diagnosis) -> str | None:
+    """Return why the stated fault is not written into a model; None where it is, or without one."""
     if found.correction is not None:
-        return "a wrong start belongs to these logs and not to the model: pass --initial-soc"
+        is_of_log = found.correction.is_of_log
+        start = "a wrong start belongs to these logs and not to the model: pass --initial-soc"
+        return start if is_of_log else None
     tried = [found.corrections[fault] for fault in found.posterior.stated]
     if not tried:
-        return "no fault is stated"
-    for correction in tried:
-        if correction.is_better:
-            before, after = (number(x, 2, "%") for x in found.soc_mae_pct(correction))
-            with_it = f"with the {_title(correction.evidence.fault)} corrected"
-            return f"{with_it}, the SoC error of left-out rows grows ({before} → {after})"
-    first = tried[0]
-    change = f"{volts(rms(first.errors.before_v))} → {volts(first.rmse_v)}"
-    with_it = f"with the {_title(first.evidence.fault)} corrected"
+        return None
+    better = next((each for each in tried if each.is_better), None)
+    refused = better or tried[0]
+    with_it = f"with the {_title(refused.evidence.fault)} corrected"
+    if better is not None:
+        before, after = (number(x, 2, "%") for x in found.soc_mae_pct(better))
+        return f"{with_it}, the SoC error of left-out rows grows ({before} → {after})"
+    change = f"{volts(rms(refused.errors.before_v))} → {volts(refused.rmse_v)}"
     return f"{with_it}, the voltage error of left-out rows does not surely shrink ({change})"
 
 
