@@ -290,16 +290,18 @@ def _measured(quantity: str, unit: str, words: set[str]) -> Meaning:
     of_cells = WORDS["cell"] | WORDS["display"]
     is_of_pack = bool(named & WORDS["pack"])
     has_unknown = bool(named - WORDS["pack"] - WORDS["neutral"] - WORDS["ambient"] - of_cells)
-    is_ambient = bool(named & WORDS["ambient"])
-    ranks = (
-        (is_other or bool(named & WORDS["other"]), Rank.OTHER),
-        (is_ambient, Rank.AMBIENT if quantity == "temperature" else Rank.GUESS),
-        (not is_of_pack and (has_unknown or is_vague), Rank.GUESS),
-        (has_unknown or is_part, Rank.PART),
-        (bool(named & (of_cells | WORDS["derived"])), Rank.DERIVED),
-        (is_of_pack, Rank.DIRECT),
-        (bool(named), Rank.PLAIN),
-        (True, Rank.BARE),
-    )
-    rank = next(rank for holds, rank in ranks if holds)
+    if is_other or named & WORDS["other"]:
+        rank = Rank.OTHER
+    elif named & WORDS["ambient"]:
+        rank = Rank.AMBIENT if quantity == "temperature" else Rank.GUESS
+    elif not is_of_pack and (has_unknown or is_vague):
+        rank = Rank.GUESS
+    elif has_unknown or is_part:
+        rank = Rank.PART
+    elif named & (of_cells | WORDS["derived"]):
+        rank = Rank.DERIVED
+    elif is_of_pack:
+        rank = Rank.DIRECT
+    else:
+        rank = Rank.PLAIN if named else Rank.BARE
     return Meaning(quantity, unit, rank, is_numbered, source)

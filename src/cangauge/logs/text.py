@@ -59,40 +59,23 @@ class TextTable(NamedTuple):
         InputError
             If there is no row, or a row in the middle has the wrong number of cells.
         """
-        width, odd_rows = self._width(places), list[Any]()
-
-        def skip(row: Any) -> str:
-            odd_rows.append(row)
-            return "skip"
-
+        width = self._width(places)
         names = [f"c{place}" for place in range(width)]
-        # One thread: otherwise pyarrow does not number odd rows.
-        how = pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines)
-        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
-
-        def parsed(part: bytes, types: Mapping[str, Any]) -> Any:
-            cells = pacsv.ConvertOptions(
-                include_columns=[*types],
-                column_types=types,
-                strings_can_be_null=True,
-                check_utf8=False,  # `as_utf8` has
-            )
-            odd_rows.clear()
-            return pacsv.read_csv(pa.BufferReader(part), how, rows, cells)
-
+        texts = {names[place]: pa.string() for place in places}
         data = as_utf8(self.head.read())
         is_whole = data.endswith((b"\n", b"\r"))
-        types = {names[place]: pa.string() for place in places}
         try:
-            beginning = parsed(data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1] or data, types)
+            beginning, _ = self._parsed(
+                data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1] or data, names, texts
+            )
             numbers = numbers_in(beginning, [names[place] for place in apart])
             try:
-                table = parsed(data, types | numbers)
+                table, odd_rows = self._parsed(data, names, texts | numbers)
                 is_refuted = bool(numbers) and has_spelled_numbers(table.columns)
             except pa.ArrowInvalid:
                 is_refuted = True
             if is_refuted:  # by a cell far below
-                table = parsed(data, types)
+                table, odd_rows = self._parsed(data, names, texts)
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0]
             raise self._error(f"the table cannot be read: {reason}", "export it again") from error
@@ -106,6 +89,27 @@ class TextTable(NamedTuple):
         headings = [*self.headings, *repeat("", width)]
         columns = {place: table.column(names[place]) for place in places}
         return read_cells(columns, headings, str(self.head.path), self.head.decimal_mark, apart)
+
+    def _parsed(
+        self, data: bytes, names: list[str], types: Mapping[str, Any]
+    ) -> tuple[Any, list[Any]]:
+        """Return columns of a text by their types, and the rows of another number of cells."""
+        odd_rows = list[Any]()
+
+        def skip(row: Any) -> str:
+            odd_rows.append(row)
+            return "skip"
+
+        # One thread: otherwise pyarrow does not number odd rows.
+        how = pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines)
+        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
+        cells = pacsv.ConvertOptions(
+            include_columns=[*types],
+            column_types=types,
+            strings_can_be_null=True,
+            check_utf8=False,  # `as_utf8` has
+        )
+        return pacsv.read_csv(pa.BufferReader(data), how, rows, cells), odd_rows
 
     def _width(self, places: Sequence[int]) -> int:
         """Return the number of cells of the first row, which may be another than the header's."""

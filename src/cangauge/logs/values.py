@@ -105,9 +105,9 @@ def numbers_in(beginning: Any, apart: Collection[str] = ()) -> dict[str, Any]:
 
 def has_spelled_numbers(columns: Sequence[Any]) -> bool:
     """Return whether columns hold numbers that are not written as programs do (`3,8`)."""
-    return any(
-        is_text(cells) and _any(_numbers_among(_spelled_alike(cells)), "[,]") for cells in columns
-    )
+    texts = [cells for cells in columns if is_text(cells)]
+    with_commas = [cells for cells in texts if pc.any(pc.match_substring(cells, ",")).as_py()]
+    return any(_any(_numbers_among(_spelled_alike(cells)), "[,]") for cells in with_commas)
 
 
 def _as_numbers(cells: Any) -> Any:
@@ -149,8 +149,9 @@ def _with_decimal_points(
     apart: Collection[int],
 ) -> dict[int, Any]:
     """Return columns of text, their numbers with `-` as minus and `.` as the only mark."""
-    alike = {place: _spelled_alike(cells) for place, cells in texts.items()}
-    numbers = {place: _numbers_among(cells) for place, cells in alike.items()}
+    are_clocks = {place: pc.all(pc.match_substring(texts[place], ":")).as_py() for place in texts}
+    alike = {k: cells if are_clocks[k] else _spelled_alike(cells) for k, cells in texts.items()}
+    numbers = {k: _numbers_among(cells) for k, cells in alike.items() if not are_clocks[k]}
     numbers = {place: cells for place, cells in numbers.items() if _any(cells, "[.,]")}
     own = {place: _decimal_marks(cells) for place, cells in numbers.items()}
     of_table = {
