@@ -108,6 +108,7 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
     tried = [healthy.tried[k] for k in at.max(axis=1)]
     n, rows = healthy.n, _design(healthy, logs, at)
     left = rows.eliminated(n).table
+    # Gradient and curvature of the log likelihood of each trial's size, about zero.
     g, s = left[:, :-1].T @ left[:, -1], np.maximum(np.sum(left[:, :-1] ** 2, axis=0), 1e-9)
     bounds = np.array([_bounds(shape, logs) for shape in tried])
     size = np.clip(g / (s + RIDGE), *bounds.T)
@@ -121,14 +122,13 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
         mine, o = np.flatnonzero(names == name), healthy.excess[name]
         top = int(mine[np.argmax(gain[mine])])
         bound, delta = tried[top].bound, solved[:, -1] - solved[:, top] * size[top]
-        columns = list(zip(logs, at[top].tolist(), strict=True))
-        square_v2 = sum(healthy.square_v2(log, delta, k, float(size[top])) for log, k in columns)
+        square_v2 = sum(
+            healthy.square_v2(log, delta, k, float(size[top]))
+            for log, k in zip(logs, at[top].tolist(), strict=True)
+        )
         visible = np.sqrt(2.0 * VISIBLE_NATS * o / s[mine]) * [tried[j].bound for j in mine]
         found[name] = Evidence(
-            tuple(
-                None if k < 0 else healthy.tried[k].in_log(log.trace.log.duration_s)
-                for log, k in columns
-            ),
+            _shapes_in(logs, healthy.tried, at[top]),
             nats=float(gain[top]),
             left_v2=square_v2 / total_s(logs),
             size=float(size[top]) * bound,
@@ -138,6 +138,16 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
             bounds=(float(bounds[top, 0]), float(bounds[top, 1])),
         )
     return found
+
+
+def _shapes_in(
+    logs: Sequence[LogRows], tried: Sequence[Shape], columns: IntArray
+) -> tuple[Shape | None, ...]:
+    """Return the shape of a trial in each log, of its column there; None for −1."""
+    return tuple(
+        None if k < 0 else tried[k].in_log(log.trace.log.duration_s)
+        for log, k in zip(logs, columns.tolist(), strict=True)
+    )
 
 
 def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> Rows:
