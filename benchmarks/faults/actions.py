@@ -13,14 +13,11 @@ from random import Random
 from typing import Any, Final, Literal
 
 from faults.bench import Bench
-from faults.fault import Action, Plan, at
-from faults.frames import Profile
+from faults.fault import Plan, at
 from faults.large_dbc import write_large_dbc
 from faults.line import HarnessBus, run
 from faults.process import run_command
 
-DISK_KB: Final = 256
-"""Size of the small disk; fits several state files [kB]."""
 LARGE_DBC_MB: Final = 3.9
 """Just below the largest that is read [MB]."""
 RELOAD_S: Final = 8.0
@@ -67,36 +64,6 @@ def queue_full_for(seconds: float) -> Plan:
     return at(0.0, do)
 
 
-def small_disk(how: Literal["full", "read-only"]) -> Plan:
-    """Put the state on a full or read-only file system, then kill and restart the service."""
-
-    def do(bench: Bench) -> None:
-        folder = str(bench.state_path.parent)
-        kept = bench.state_path.read_bytes() if bench.state_path.exists() else b""
-        run(["mount", "-t", "tmpfs", "-o", f"size={DISK_KB}k", "tmpfs", folder])
-        bench.at_end(lambda: run(["umount", "-l", folder]))
-        if kept:
-            bench.state_path.write_bytes(kept)
-        if how == "read-only":
-            run(["mount", "-o", "remount,ro", folder])
-        else:
-            _fill(Path(folder, "ballast"))
-        bench.wait(5.0)
-        bench.kill_and_restart()
-
-    return at(0.0, do)
-
-
-def _fill(path: Path) -> None:
-    try:
-        with path.open("wb") as file:
-            for _ in range(2 * DISK_KB):
-                file.write(bytes(1024))
-                file.flush()
-    except OSError:
-        return  # full, as intended
-
-
 def clock_set(seconds: float) -> Plan:
     """Set the machine's clock."""
 
@@ -111,17 +78,6 @@ def clock_set(seconds: float) -> Plan:
 
 
 BEGIN: Final = 0.05
-
-
-def kills(number: int) -> Plan:
-    """Kill and restart the service at random times."""
-
-    def plan(profile: Profile, rng: Random) -> list[Action]:
-        first, last = profile.fault_s
-        moments = [rng.uniform(first, last) for _ in range(number)]
-        return [Action(moment, Bench.kill_and_restart) for moment in moments]
-
-    return plan
 
 
 def broken_config(text: str | None) -> Plan:

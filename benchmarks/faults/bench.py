@@ -64,8 +64,6 @@ class ServiceSetup:
         "generic" or "float".
     with_state : bool
         Use a state file.
-    cold : bool
-        Start it in a fresh interpreter.
     target : callable
         The service, or a replacement in tests of the harness.
     """
@@ -73,7 +71,6 @@ class ServiceSetup:
     config: dict[str, Any]
     vehicle: str = "generic"
     with_state: bool = False
-    cold: bool = False
     target: Target = cangauge
 
 
@@ -124,8 +121,7 @@ class Bench:
         arguments = ["run", "--config", str(self.config_path)]
         if with_state:
             arguments += ["--state", str(self.state_path)]
-        log, setup = self.folder / f"{name}.txt", self._setup
-        return Process(arguments, log, setup.target, cold=setup.cold)
+        return Process(arguments, self.folder / f"{name}.txt", self._setup.target)
 
     def write_config(self, **changes: object) -> None:
         """Write the configuration with permanent changes."""
@@ -140,11 +136,6 @@ class Bench:
     def restart(self) -> None:
         """Stop the service by SIGTERM and start it again."""
         self.service.stop()
-        self.start()
-
-    def kill_and_restart(self) -> None:
-        """Kill the service and start it again."""
-        self.service.kill()
         self.start()
 
     def reload(self) -> None:

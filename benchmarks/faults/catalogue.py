@@ -173,7 +173,6 @@ ERRORS = [
 ]  # fmt: skip
 
 NEEDS_VCAN: Final = frozenset[Need]({"vcan"})
-NEEDS_DISK: Final = frozenset[Need]({"vcan", "root", "state"})
 
 INTERFACE = [
     Fault("interface down", "down for 1 s", REAL, plan=do.down_for(1.0), needs=NEEDS_VCAN),
@@ -186,13 +185,6 @@ INTERFACE = [
           needs=NEEDS_VCAN),
 ]  # fmt: skip
 
-DISK = [
-    Fault("disk full", "state on a full file system; killed and started again", REAL,
-          plan=do.small_disk("full"), needs=NEEDS_DISK),
-    Fault("state read-only", "state on a read-only file system; killed and started again",
-          REAL, plan=do.small_disk("read-only"), needs=NEEDS_DISK),
-]  # fmt: skip
-
 MACHINE_CLOCK = [
     Fault("machine's clock back", "set back by an hour", REAL, plan=do.clock_set(-3600.0),
           needs=frozenset({"vcan", "root", "alone"}), recovers=True),
@@ -202,10 +194,6 @@ MACHINE_CLOCK = [
 
 RESTARTS = [
     Fault("SIGTERM, restart", "stopped and started again", REAL, plan=at(do.BEGIN, Bench.restart),
-          needs=frozenset({"state"})),
-    Fault("SIGKILL, restart", "killed at a random time, fresh interpreter started", REAL,
-          plan=do.kills(1), needs=frozenset({"state"}), cold=True),
-    Fault("SIGKILL three times", "killed at random times and started again", REAL, plan=do.kills(3),
           needs=frozenset({"state"})),
 ]  # fmt: skip
 
@@ -338,7 +326,7 @@ ON_ANY_BUS: Final = [
 ON_UDP: Final = [*ON_ANY_BUS, *STAMPS, *UDP_PACKETS]
 _ON_KERNEL: Final = ("error frames", "remote frames")
 """Faults that SocketCAN handles differently: run on vcan too."""
-_VCAN_ONLY: Final = [*INTERFACE, *DISK, *MACHINE_CLOCK]
+_VCAN_ONLY: Final = [*INTERFACE, *MACHINE_CLOCK]
 ON_VCAN: Final = [*_VCAN_ONLY, *(fault for fault in ON_ANY_BUS if fault.name in _ON_KERNEL)]
 """Faults that run on vcan by default; all of `ON_ANY_BUS` can."""
 

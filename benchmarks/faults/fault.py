@@ -48,8 +48,6 @@ class Fault:
         Keys of the service's configuration.
     vehicle : str
         "generic", or "float": IEEE floats without CRC.
-    cold : bool
-        Start the service in a fresh interpreter.
     target : callable, optional
         Instead of the service as it is: with changed stamps (see `stamps`).
     reports : Reason
@@ -68,7 +66,6 @@ class Fault:
     needs: frozenset[Need] = frozenset()
     config: dict[str, Any] = field(default_factory=dict)
     vehicle: str = "generic"
-    cold: bool = False
     target: Target | None = None
     reports: Reason = Reason.NONE
     recovers: bool = False

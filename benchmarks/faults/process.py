@@ -1,7 +1,7 @@
 """Process of the service: start, signals, and detection of an unexpected end.
 
 Processes are forked from one that has imported the service (multiprocessing's forkserver), so that
-many start quickly; `cold` starts a fresh interpreter, as a service manager does.
+many start quickly.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PRELOAD: Final = [
     "can.interfaces.udp_multicast",
     "can.interfaces.socketcan",
 ]
-_COLD: Final = "from cangauge.__main__ import main; main()"
+_COMMAND: Final = "from cangauge.__main__ import main; main()"
 _CHILDREN: Final = threading.Lock()
 """Held while a process starts and while its status is read: a start reads the status of every
 process that has ended, and it can be read only once."""
@@ -57,7 +57,7 @@ def prepare() -> None:
 def run_command(arguments: list[str]) -> int:
     """Run a command in a fresh interpreter; return its exit status."""
     return subprocess.run(
-        [sys.executable, "-c", _COLD, *arguments], capture_output=True, timeout=60.0, check=False
+        [sys.executable, "-c", _COMMAND, *arguments], capture_output=True, timeout=60.0, check=False
     ).returncode
 
 
@@ -70,18 +70,13 @@ class Process:
     log : Path
         Receives stdout and stderr.
     target : callable
-    cold : bool
-        Start a fresh interpreter; for `cangauge` only.
     """
 
-    def __init__(
-        self, arguments: list[str], log: Path, target: Target = cangauge, *, cold: bool = False
-    ) -> None:
+    def __init__(self, arguments: list[str], log: Path, target: Target = cangauge) -> None:
         self._arguments = arguments
         self._log = log
         self._target = target
-        self._cold = cold
-        self._child: BaseProcess | subprocess.Popen[bytes] | None = None
+        self._child: BaseProcess | None = None
         self._stop_requested = False
         self.started_s = 0.0
         self.stop_seconds: list[float] = []
@@ -92,18 +87,10 @@ class Process:
     def start(self) -> None:
         """Start the process."""
         self._stop_requested = False
-        if self._cold:
-            with self._log.open("ab") as out:
-                self._child = subprocess.Popen(
-                    [sys.executable, "-c", _COLD, *self._arguments], stdout=out, stderr=out
-                )
-        else:
-            child = CONTEXT.Process(
-                target=_enter, args=(self._target, self._arguments, str(self._log))
-            )
-            with _CHILDREN:
-                child.start()
-            self._child = child
+        child = CONTEXT.Process(target=_enter, args=(self._target, self._arguments, str(self._log)))
+        with _CHILDREN:
+            child.start()
+        self._child = child
         self.started_s = time.monotonic()
 
     def signal(self, number: signal.Signals) -> None:
@@ -150,11 +137,10 @@ class Process:
         return self._log.read_text(errors="replace") if self._log.exists() else ""
 
     def _code(self) -> int | None:
-        child = self._child
-        if child is None:
+        if self._child is None:
             return 0
         with _CHILDREN:
-            return child.poll() if isinstance(child, subprocess.Popen) else child.exitcode
+            return self._child.exitcode
 
     def _wait(self, seconds: float) -> int | None:
         until = time.monotonic() + seconds

@@ -57,8 +57,7 @@ def run_fault(fault: Fault, line: BusLine, seed: int, target: Target = cangauge)
     folder = Path(tempfile.mkdtemp(prefix="fault-"))
     rng = Random(f"{seed} {fault.name}")  # noqa: S311 - must be repeatable
     setup = ServiceSetup(
-        fault.config, fault.vehicle, with_state="state" in fault.needs, cold=fault.cold,
-        target=target,
+        fault.config, fault.vehicle, with_state="state" in fault.needs, target=target,
     )  # fmt: skip
     if line.is_vcan:
         line.create()
