@@ -208,7 +208,7 @@ def test_disk(fault: str, tmp_path: Path) -> None:
             time.sleep(random.uniform(0.0, 2.0))
             if fault == "read-only":
                 mend, words = stack.enter_context(read_only(folder)), "not writable"
-            assert waits(lambda: words in life.text, 60.0), life.text  # noqa: B023
+            assert waits(lambda: words in life.text, 180.0), life.text  # noqa: B023
             battery.wait(20)  # it goes on
             check_saved(folder)
             before_s = saved_s(folder)
