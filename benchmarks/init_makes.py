@@ -37,9 +37,9 @@ from cangauge.bus.database import load_dbc
 from cangauge.errors import InputError
 from cangauge.extras.discovery.by_name import clear_roles, named_signals
 from cangauge.extras.discovery.candidate import Candidate
-from cangauge.extras.discovery.fields import collect
 from cangauge.extras.discovery.proposal import Proposal
 from cangauge.extras.discovery.search import search
+from cangauge.extras.discovery.streams import collect
 from frame_layouts import STEP_S, Bits, Frame, encode
 
 SECONDS = 120.0

@@ -12,9 +12,9 @@ import pytest
 
 from cangauge.bus.captures import open_capture
 from cangauge.extras.discovery.candidate import Candidate
-from cangauge.extras.discovery.fields import collect
 from cangauge.extras.discovery.proposal import Proposal
 from cangauge.extras.discovery.search import search
+from cangauge.extras.discovery.streams import collect
 from drive_captures import CARS, Bits, Car, Frame, capture
 from init_makes import HELD_OUT, evaluate
 from selection import nightly_except
@@ -126,6 +126,20 @@ def test_multiplexed_frames_are_taken_apart() -> None:
     streams = collect(messages)
     selected = [each.selected for each in streams if each.selector is not None]
     assert selected == [0, 1, 2, 3]
+
+
+def test_data_that_follow_a_multiplexer_are_not_taken_for_it() -> None:
+    rng = np.random.default_rng(2)
+    drift = 3000 + np.cumsum(rng.integers(-2, 3, 600))
+    messages = []
+    for step, level in enumerate(drift.tolist()):
+        value = step % 3
+        words = [level + 700 * value, 9 * level % 4001 + 1300 * (2 - value)]
+        data = bytes([value]) + b"".join(word.to_bytes(2, "big") for word in words)
+        messages.append(can.Message(timestamp=0.01 * step, arbitration_id=5, data=data))
+    streams = collect(messages)
+    assert [each.selected for each in streams] == [0, 1, 2]
+    assert {each.selector.first // 8 for each in streams} == {0}
 
 
 LEAF = (

@@ -209,3 +209,43 @@ def test_a_soc_moves_no_further_than_the_charge() -> None:
     found = search(frames({0x100: words, 0x102: [256 * soc + noise]}))
     first, *_ = found.candidates["soc_reference"]
     assert first.bits == {(0x102, False, bit) for bit in range(8, 16)}
+
+
+def pair_of(amps: np.ndarray) -> list[np.ndarray]:
+    """Return a current and the voltage that follows it as a pack's does, not exactly."""
+    noise = np.random.default_rng(7).normal(0.0, 0.4, len(amps))
+    return [raw(amps, 0.1, -500.0), raw(370.0 - 0.1 * amps + noise, 0.1)]
+
+
+def test_what_falls_with_time_is_no_soc() -> None:
+    amps = load(1)
+    drawn_ah = np.cumsum(amps) * 0.1 / 3600.0
+    falls = {
+        0x102: [raw(90.0 - 2.0 * drawn_ah, 0.05)],
+        0x104: [raw(80.0 - 5.0 * np.linspace(0.0, 1.0, len(amps)), 0.05)],
+    }
+    words = pair_of(amps)
+    found = search(frames({0x100: words, **falls}))
+    assert {each.stream.arbitration_id for each in found.candidates["soc_reference"]} == {0x102}
+    still = search(frames({0x100: words, 0x104: falls[0x104]}))
+    assert still.candidates["soc_reference"] == []
+    assert any("no SoC field found" in remark for remark in still.remarks)
+
+
+def test_a_soc_whose_bits_are_open_is_left_to_the_user(tmp_path: Path) -> None:
+    amps = load(1)
+    low = raw(90.0 - 100.0 * np.cumsum(amps) * 0.1 / 3600.0 / 20.0, 0.1) % 256
+    one = np.ones(len(amps), dtype=int)
+    words = pair_of(amps)
+    # Either byte beside the one that moves may be its upper one: 512 or 256 steps more.
+    capture = frames({0x100: words, 0x102: [one + 256 * low, 2 * one]})
+    write(tmp_path, capture, {})
+    call = ("init", tmp_path / "d.log", "-o", tmp_path / "out", "--nominal-voltage", "370")
+    call += ("--choose", "current=1", "--choose", "voltage=1")
+    done = in_process(*call)
+    assert done.code == 0, done.err
+    assert "take one by --choose soc=N" in done.err
+    assert "[soc_reference]" not in (tmp_path / "out" / "car.toml").read_text(encoding="utf-8")
+    done = in_process(*call, "--force", "--choose", "soc=2")
+    assert done.code == 0, done.err
+    assert "[soc_reference]" in (tmp_path / "out" / "car.toml").read_text(encoding="utf-8")

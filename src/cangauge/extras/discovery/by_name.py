@@ -48,6 +48,7 @@ _PARTS: Final = _words(
     " lamp gear relay contactor coil supply ignition module string"
 )
 """Other parts of a car, whose current, SoC and temperature are not the pack's."""
+_PAIR: Final = ("current", "voltage")
 _EXTREMES: Final = _words("max min cell cells")
 """Words that the pack's temperature may hold in its name: that of its warmest cell."""
 _LIMITS: Final = _EXTREMES | _words(
@@ -103,61 +104,23 @@ class _NamedSignal:
 
     def judged(self, role: str, nominal_v: float | None) -> Candidate | None:
         """Return it with its score for a role and what speaks against it; None: it has none."""
-        wanted, codec = ROLES[role], self.codec
-        own, of = _words_of(codec.name), _words_of(self.message)
-        unit = unit_of(wanted.column, codec.unit) if codec.unit else None
-        scale, offset = unit or (1.0, 0.0)
-        is_soc, is_pair = role == "soc_reference", role in {"current", "voltage"}
-        is_named = bool(own & _words(wanted.words)) or (is_soc and {"state", "charge"} <= own)
-        names_pack = bool(own & _BATTERY)
-        others, parts = own & (_LIMITS | _PARTS), of & _PARTS
-        if role == "temperature":
-            others -= _EXTREMES
-        elif is_pair and not names_pack:
-            others |= own - _words(wanted.words) - _NEUTRAL
-        lowest, highest = wanted.within
-        middle = median(scale * np.unique(self.value) + offset) if len(self.value) else lowest
-        if not lowest <= middle <= highest or not (unit or (is_named and not codec.unit)):
-            return None
-        if not is_pair and (parts or (others if role == "temperature" else own & _PARTS)):
-            return None
-        score = (
-            2.0 * (is_named or role == "temperature")
-            + 1.0 * (unit is not None)
-            + 1.0 * names_pack
-            + 0.5 * bool(of & _BATTERY)
-            - 1.5 * bool(others)
-            - 0.5 * bool(of & (_LIMITS | _PARTS))
-        )
-        if score <= 0.0 or (is_soc and not is_named):
+        unit = unit_of(ROLES[role].column, self.codec.unit) if self.codec.unit else None
+        score = self._score(role, has_unit=unit is not None)
+        if score <= 0.0 or not self._is_plausible(role, unit):
             return None
         low = high = math.nan
         if len(self.value):
             low, high = float(self.value.min()), float(self.value.max())
         # Less where nothing of it is sent, or a current stands still.
         score -= 1.0 * math.isnan(low) + 0.5 * (role == "current" and low == high)
-        other = others or (frozenset() if names_pack else parts)
-        most_a, top_v = scale * max(-low, high), scale * self.holds[1] + offset
-        bits = codec.field.width
-        objections = {
-            "no unit": unit is None,
-            f"{bits} bits": bits < LEAST_BITS,
-            f"no word for a {role} in its name": is_pair and not is_named,
-            "no word for a pack in its name": is_pair and not (own | of) & _BATTERY,
-            f"of another value: {', '.join(sorted(other))}": other,
-            f"reaches {most_a:.4g} A": role == "current" and unit and most_a > MOST_A,
-            f"holds up to {top_v:.4g} V": (
-                role == "voltage" and unit and top_v <= (nominal_v or _HIGH_V)
-            ),
-        }
         return Candidate(
             role=role,
-            name=f"{self.message}.{codec.name}",
+            name=f"{self.message}.{self.codec.name}",
             message=self.message,
-            signal=codec.name,
-            unit=codec.unit,
+            signal=self.codec.name,
+            unit=self.codec.unit,
             score=score,
-            against=tuple(text for text, holds in objections.items() if holds),
+            against=tuple(self._objections(role, unit, nominal_v)),
             low=low,
             high=high,
             holds=self.holds,
@@ -165,6 +128,70 @@ class _NamedSignal:
             is_wrapped=self.is_wrapped,
             not_available=self.codes,
         )
+
+    def _is_named(self, role: str) -> bool:
+        own = _words_of(self.codec.name)
+        is_state = role == "soc_reference" and {"state", "charge"} <= own
+        return is_state or bool(own & _words(ROLES[role].words))
+
+    def _of_others(self, role: str) -> frozenset[str]:
+        """Return the words of its name that are said of another value, or of another part."""
+        own = _words_of(self.codec.name)
+        others = own & (_LIMITS | _PARTS)
+        if role == "temperature":
+            return others - _EXTREMES
+        if role in _PAIR and not own & _BATTERY:
+            return others | own - _words(ROLES[role].words) - _NEUTRAL
+        return others
+
+    def _score(self, role: str, *, has_unit: bool) -> float:
+        """Return the worth of its words and its unit."""
+        own, of = _words_of(self.codec.name), _words_of(self.message)
+        return (
+            2.0 * (self._is_named(role) or role == "temperature")
+            + 1.0 * has_unit
+            + 1.0 * bool(own & _BATTERY)
+            + 0.5 * bool(of & _BATTERY)
+            - 1.5 * bool(self._of_others(role))
+            - 0.5 * bool(of & (_LIMITS | _PARTS))
+        )
+
+    def _is_plausible(self, role: str, unit: tuple[float, float] | None) -> bool:
+        """Whether unit, level and name allow a role; SoC and temperature are of no other part."""
+        own, of = _words_of(self.codec.name), _words_of(self.message)
+        lowest, highest = ROLES[role].within
+        scale, offset = unit or (1.0, 0.0)
+        middle = median(scale * np.unique(self.value) + offset) if len(self.value) else lowest
+        is_named = self._is_named(role)
+        if not lowest <= middle <= highest or not (unit or (is_named and not self.codec.unit)):
+            return False
+        if role == "soc_reference":
+            return is_named and not (own | of) & _PARTS
+        return role in _PAIR or not (of & _PARTS or self._of_others(role))
+
+    def _objections(
+        self, role: str, unit: tuple[float, float] | None, nominal_v: float | None
+    ) -> Iterator[str]:
+        """Yield what speaks against a role."""
+        own, of = _words_of(self.codec.name), _words_of(self.message)
+        scale, offset = unit or (1.0, 0.0)
+        if unit is None:
+            yield "no unit"
+        if self.codec.field.width < LEAST_BITS:
+            yield f"{self.codec.field.width} bits"
+        if role in _PAIR and not self._is_named(role):
+            yield f"no word for a {role} in its name"
+        if role in _PAIR and not (own | of) & _BATTERY:
+            yield "no word for a pack in its name"
+        parts = frozenset() if own & _BATTERY else of & _PARTS
+        if other := self._of_others(role) or parts:
+            yield f"of another value: {', '.join(sorted(other))}"
+        most_a = scale * float(np.abs(self.value).max(initial=0.0))
+        if role == "current" and unit and most_a > MOST_A:
+            yield f"reaches {most_a:.4g} A"
+        top_v = scale * self.holds[1] + offset
+        if role == "voltage" and unit and top_v <= (nominal_v or _HIGH_V):
+            yield f"holds up to {top_v:.4g} V"
 
 
 class _NamedFrames:

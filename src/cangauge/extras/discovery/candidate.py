@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from cangauge.extras.discovery.fields import Place, Stream
+    from cangauge.extras.discovery.streams import Place, Stream
 
 MOST_A: Final = 1500.0
 """Largest current of a pack [A]: the fastest cars draw 1,500 A."""

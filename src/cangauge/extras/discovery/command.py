@@ -372,6 +372,11 @@ def _show(proposal: Proposal, files: Sequence[str], output: Path) -> None:
         note("note: the DBC reads negative currents as large ones; the map has signed = true")
     if why := proposal.proof.get("soc", {}).get("why"):
         note(f"SoC: {why}.")
+    if proposal.candidates.get("soc_reference") and "soc_reference" not in proposal.chosen:
+        note(
+            "SoC: open, so the map has none. Compare the ranges above with the car's display, and"
+            " take one by --choose soc=N."
+        )
     if proposal.fixed_c is not None:
         note(
             "note: no temperature is clearly the pack's or chosen: the files assume"

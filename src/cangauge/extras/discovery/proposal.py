@@ -155,10 +155,10 @@ class Proposal:
         if self.dbc is not None:
             own, head = self.dbc.resolve(), (*head, self.sign_text)
             dbc = own.name if own.parent == folder.resolve() else str(own)
-            for role in ("soc_reference", "temperature"):
-                if role not in self.chosen and (found := self.candidates[role]):
-                    named = ", ".join(f"{each.name} ({each.range_text})" for each in found)
-                    head = (*head, f"Not clear, so not used, {ROLES[role].column}: {named}.")
+        for role in ("soc_reference", "temperature"):
+            if role not in self.chosen and (found := self.candidates.get(role)):
+                named = ", ".join(f"{each.name} ({each.range_text})" for each in found)
+                head = (*head, f"Not clear, so not used, {ROLES[role].column}: {named}.")
         period_s = max(self.signals[role].period_s for role in ("current", "voltage"))
         # A DBC without a capture has no periods.
         pair_s = 0.1 if math.isnan(period_s) else min(max(0.02, 1.2 * period_s), 1.0)

@@ -7,6 +7,7 @@ what falls with the charge of that current.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -24,18 +25,12 @@ from cangauge.extras.discovery.candidate import (
     SHOWN,
     Candidate,
     Level,
-    is_capacity,
 )
-from cangauge.extras.discovery.fields import Field, collect, fields_of
-from cangauge.extras.discovery.pairs import (
-    IMPOSSIBLE,
-    LARGEST_R2,
-    Grid,
-    Row,
-    best_pairs,
-    round_zeros,
-)
+from cangauge.extras.discovery.fields import Field, fields_of
+from cangauge.extras.discovery.pairs import IMPOSSIBLE, best_pairs
 from cangauge.extras.discovery.proposal import Proposal
+from cangauge.extras.discovery.rows import Grid, Row, round_zeros
+from cangauge.extras.discovery.streams import collect
 from cangauge.logs.sign import correlation
 
 VOLTAGE_SCALES: Final = {
@@ -50,8 +45,19 @@ VOLTAGE_SCALES: Final = {
     2.0: -3.0,
 }
 """Usual scales [V] and their log priors [nats], by their frequency in public DBC files."""
-SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
-"""Usual scales of a SoC [%]."""
+SOC_SCALES: Final = {
+    0.1: 0.0,
+    0.5: -0.3,
+    0.01: -0.5,
+    1.0: -0.5,
+    0.4: -1.0,
+    0.05: -1.0,
+    0.025: -1.5,
+    0.02: -1.5,
+    0.0025: -2.0,
+    1.0 / 640.0: -2.0,
+}
+"""Usual scales of a SoC [%] and their log priors [nats]; the last is that of SAE J1939."""
 BETWEEN_S: Final = 10.0
 """Pause that is put between captures [s]: as long as trends that the search takes away."""
 ENOUGH_NATS: Final = 3.0
@@ -95,15 +101,21 @@ def search(
             " chosen by their smoothness alone; record while driving"
         )
     if not soc:
-        remarks.append("no field falls with the charge: record a longer drive to find the SoC")
+        remarks.append(
+            "no SoC field found: none follows the charge more closely than the time; record a"
+            " longer drive, of several % SoC"
+        )
     if next(frames, None) is not None:
         remarks.append(f"ranges and steps are those of the first {duration(grid.duration_s)}")
     seen = f"{grid.duration_s:.0f} s of frames: {len(fields)} numbers of {len(streams)} ids"
     found = {"current": current, "voltage": voltage, "soc_reference": soc}
+    clear = [role for role in ("current", "voltage") if found[role] and _is_clear(found[role])]
+    if soc and not any(each.bits & soc[0].bits for each in soc[1:]):
+        clear.append("soc_reference")
     return Proposal(
         method="physics",
         candidates=found,
-        clear=[role for role, of in found.items() if of and (of is soc or _is_clear(of))],
+        clear=clear,
         head=(
             f"Found by physics in {seen}.",
             *remarks,
@@ -154,18 +166,42 @@ def _socs(
     voltage: Candidate,
     row: Row,
 ) -> list[Candidate]:
-    """Return the candidates for SoC, by the charge of a current."""
+    """Return what falls with the charge of a current, best first.
+
+    Of readings that share bits, those are kept between which the data do not decide.
+    """
     amps = current.sign * (current.scale * row.means_on(grid) + current.offset)
     span = grid.longest(0.5 * BETWEEN_S)
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
     least_ah = LEAST_HOURS * float(np.abs(amps).max())
-    found = (_as_charge(field, grid, span, drawn_ah, least_ah) for field in fields)
-    taken, kept = current.bits | voltage.bits, []
-    for each in sorted(filter(None, found), key=attrgetter("score"), reverse=True):
-        if not each.bits & taken:  # a field of a better one
+    found = []
+    for field in fields:
+        values = grid.means(field.stream, field.raw, field.missing)[span]
+        if _falls_with(drawn_ah, values, field.step) >= ENOUGH_NATS:
+            found += _as_soc(field, values, drawn_ah, least_ah)
+    kept: list[Candidate] = []
+    for each in sorted(found, key=attrgetter("score"), reverse=True):
+        better = [other.score for other in kept if other.bits & each.bits]
+        if each.score > max(better, default=-math.inf) - ENOUGH_NATS:
             kept.append(each)
-            taken |= each.bits
-    return kept[:SHOWN]
+    return [each for each in kept if not each.bits & (current.bits | voltage.bits)][:SHOWN]
+
+
+def _falls_with(drawn_ah: FloatArray, values: FloatArray, step: float) -> float:
+    """Return the log likelihood ratio of a line over the charge against one over time.
+
+    It is 0 for what rises. Both lines leave at least the rounding of the field. The levels that the
+    charge tells apart count as independent.
+    """
+    by_charge = correlation(values, drawn_ah)
+    if by_charge >= 0.0:
+        return 0.0
+    by_time = correlation(values, np.arange(len(values), dtype=np.float64))
+    of_charge, of_time = (
+        max((1.0 - r * r) * float(values.var()), step**2 / 12.0) for r in (by_charge, by_time)
+    )
+    levels = float(np.ptp(values)) / math.sqrt(12.0 * of_charge)
+    return 0.5 * levels * math.log(of_time / of_charge)
 
 
 def _as_current(field: Field) -> Row | None:
@@ -236,47 +272,38 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
     return best
 
 
-def _as_charge(
-    field: Field, grid: Grid, span: slice, drawn_ah: FloatArray, least_ah: float
-) -> Candidate | None:
-    """Return a field as a SoC, if it falls as the charge is drawn in a span of the grid."""
-    distinct = len(np.unique(field.values))
-    if field.best.is_signed or distinct < 4:
-        return None
-    values = grid.means(field.stream, field.raw, field.missing)[span]
-    spread, moved = float(np.std(values)), float(np.std(drawn_ah))
-    r = correlation(values, drawn_ah)
-    if r > -0.95:
-        return None
-    # It moves no further than the charge: noise below it, or bits in a wrong order, would.
-    way, charge_way = (float(np.abs(np.diff(each)).sum()) for each in (values, drawn_ah))
-    if way * moved > 2.0 * charge_way * spread:
-        return None
-    evidence = -0.5 * distinct * math.log(1.0 - min(r * r, LARGEST_R2))
-    readings: list[Row] = []
+def _as_soc(
+    field: Field, values: FloatArray, drawn_ah: FloatArray, least_ah: float
+) -> list[Candidate]:
+    """Return the readings of a field that falls with the charge: of each level the likeliest."""
+    evidence, r = _falls_with(drawn_ah, values, field.step), correlation(values, drawn_ah)
+    raw_ah = float(drawn_ah.std() / (-r * values.std()))
+    readings: dict[int, list[Row]] = defaultdict(list)
     for place in field.places:
-        for scale in SOC_SCALES:
+        for scale, usual in SOC_SCALES.items():
             low, high = (scale * (end + place.constant) for end in (values.min(), values.max()))
-            capacity_ah = 100.0 * moved / (spread * scale)
-            if low > 0.0 and high <= 101.0 and is_capacity(capacity_ah) and capacity_ah > least_ah:
-                score = evidence + place.nature
-                score -= 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
+            holds_soc = low > 0.0 and high <= 101.0 and scale * (1 << place.width) > 100.0
+            capacity_ah = 100.0 * raw_ah / scale
+            if holds_soc and capacity_ah > least_ah:
+                # Most packs have 30–300 Ah; the scale of the current is as uncertain.
+                likely = -0.5 * (math.log(capacity_ah / 90.0) / 1.3) ** 2
+                score = evidence + place.nature + usual + likely
                 text = f"{low:.3g} … {high:.3g} % at {scale:g} % a step ({capacity_ah:.0f} Ah)"
                 meant = Level(scale, high, text)
-                readings.append(Row(field, place, field.missing, score, (meant,)))
-    row = _likeliest(readings, by_scale=True)
-    if row is None:
-        return None
-    scale = row.levels[0].scale
-    return row.candidate(
-        "soc_reference",
-        scale,
-        0.0,
-        score=row.prior,
-        evidence=evidence,
-        correlation=r,
-        partner=f"{100.0 * moved / (spread * scale):.0f} Ah per 100 %",
-    )
+                readings[place.constant].append(Row(field, place, field.missing, score, (meant,)))
+    rows = [row for of in readings.values() if (row := _likeliest(of, by_scale=True))]
+    return [
+        row.candidate(
+            "soc_reference",
+            row.levels[0].scale,
+            0.0,
+            score=row.prior,
+            evidence=evidence,
+            correlation=r,
+            partner=f"{100.0 * raw_ah / row.levels[0].scale:.0f} Ah per 100 %",
+        )
+        for row in rows
+    ]
 
 
 def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None) -> float:
