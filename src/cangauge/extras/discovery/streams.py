@@ -151,6 +151,7 @@ def _demultiplexed(stream: Stream) -> list[Stream]:
     most = max(followers.values())
     if most == 0:
         return [stream]
+    # Data that follow a multiplexer and noise have some further followers by chance.
     likely = [place for place in codes if followers[place] >= 0.9 * most]
     selector = min(likely, key=lambda place: len(np.unique(codes[place])))
     return [
@@ -178,6 +179,7 @@ def _followers(bits: NDArray[np.uint8], place: Place, code: IntArray) -> int:
     overall = _changes(bits)
     among = [_changes(bits[code == value]) for value in values]
     within = np.average(among, axis=0, weights=counts[values])
+    # A bit of noise changes in half the frames, with or without the code.
     follows = (overall > 0.2) & (within < 0.25 * overall)
     follows[place.first : place.last + 1] = False
     others = {*(np.flatnonzero(follows) // 8).tolist()} - {place.first // 8}
@@ -189,6 +191,7 @@ def _is_cycle(code: IntArray) -> bool:
     size = int(code.max()) + 1
     steps = np.bincount(code[:-1] * size + code[1:], minlength=size * size).reshape(size, size)
     np.fill_diagonal(steps, 0)
+    # Loggers lose some per cent of the frames; the code of a measurement takes no one way.
     return bool(steps.max(1).sum() > 0.8 * len(code))
 
 
