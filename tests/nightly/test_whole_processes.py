@@ -159,10 +159,11 @@ def test_stopped(tmp_path: Path) -> None:
 
 def test_kill(tmp_path: Path) -> None:
     random, folder = Random(0), tmp_path / "life"  # noqa: S311 - repeatable
-    logs = 0
+    logs = saved = 0
     with Battery(0, DRIVE, 0.006, is_replay=True) as battery:
         for seed in range(SEEDS):
             newest = stored_logs(folder / "judge")[-1:]
+            saved += (folder / "cangauge-state.json").exists()
             with Life(battery.address, folder, **REPLAY) as life:
                 battery.wait()
                 if seed % 4 == 3:  # a life in which a log is stored, and judged
@@ -173,12 +174,14 @@ def test_kill(tmp_path: Path) -> None:
                 assert now >= min(logs, 4)
                 assert frames > 0
                 logs = now
+        saved += (folder / "cangauge-state.json").exists()
         with Life(battery.address, folder, **REPLAY) as life:
             battery.wait()
             assert life.end() == 0
     assert logs > 1
     assert clean(life.text)
-    assert life.text.count("state.restored") == SEEDS
+    # On a busy machine the first kill may come before the first state.
+    assert life.text.count("state.restored") == saved > SEEDS // 2
     assert "state.refused" not in life.text
 
 
