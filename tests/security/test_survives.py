@@ -76,6 +76,27 @@ def test_a_file_survives_a_kill_at_any_write(tmp_path: Path) -> None:
         assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
 
 
+def test_content_is_on_the_disk_before_a_name_leads_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What a power cut then leaves is the old file or the new one.
+    synced, fsync, replace = [], os.fsync, Path.replace
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        info = os.fstat(descriptor)
+        synced.append((info.st_ino, info.st_size))
+
+    def checked(self: Path, target: Path) -> Path:
+        assert (self.stat().st_ino, 20_000) in synced
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(Path, "replace", checked)
+    write_text_atomic(tmp_path / "state.json", "x" * 20_000)
+    assert (tmp_path / "state.json").stat().st_size == 20_000
+
+
 def test_logs_of_the_judge_survive_a_kill_at_any_write(tmp_path: Path) -> None:
     rows = [(float(row), 10.0, 380.0, 20.0, 50.0) for row in range(2_000)]
     random = Random(1)  # noqa: S311 - repeatable
