@@ -20,7 +20,7 @@ from cangauge.extras.judge.chain import Chain
 from cangauge.extras.judge.linearised import VARIES, Fitted, Linearised, Set, Terms
 from cangauge.model.gaussian import Rows
 
-SETTLED: Final = 0.1
+SETTLED: Final = 0.03
 """Distance from the most probable coefficients at which they are found [their σ]."""
 STEPS_AT_MOST: Final = 60
 """Most linearisations of a set of faults. Logs that agree with a model take 2 to 10."""
