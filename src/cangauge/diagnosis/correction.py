@@ -46,20 +46,21 @@ def errors_of(given: Sequence[Simulated], logs: Sequence[LogRows]) -> Errors:
     return Errors(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def soc_errors_pct(model: Model, log: LogRows) -> FloatArray:
-    """Return the absolute error of the SoC on the rows that count, start withheld [%].
+def soc_errors_pct(model: Model, log: LogRows) -> tuple[FloatArray, FloatArray]:
+    """Return absolute error and standard deviation of the SoC, start withheld [%].
 
-    NaN while the estimate settles, where it gives no SoC, and for a log that mostly has none.
+    On the rows that count. The error is NaN while the estimate settles, where it gives no SoC, and
+    for a log that mostly has none.
     """
     of, own_pct = log.trace.log, log.trace.log.soc_pct
     at = log.trace.rows[log.kept]
     if own_pct is None or np.isfinite(own_pct).mean() < 0.5:
-        return np.full(at.size, np.nan)
+        return np.full(at.size, np.nan), np.full(at.size, np.nan)
     known = np.isfinite(own_pct)
     table = estimate(replace(of, soc_pct=None), model, initial_soc_pct="auto")
     error_pct = np.abs(table.soc_pct - np.interp(of.time_s, of.time_s[known], own_pct[known]))
     is_settled = of.time_s - of.time_s[0] >= SETTLING_S
-    return np.asarray(np.where(is_settled, error_pct, np.nan)[at])
+    return np.where(is_settled, error_pct, np.nan)[at], table.soc_std_pct[at]
 
 
 def mean_errors(before: FloatArray, after: FloatArray) -> tuple[float, float]:
@@ -130,9 +131,17 @@ class HeldOut:
         """Without a correction."""
 
     @cached_property
+    def _soc(self) -> tuple[FloatArray, FloatArray]:
+        """SoC errors without a correction, and their standard deviations [%]."""
+        errors_pct, std_pct = zip(
+            *(soc_errors_pct(self._model, log) for log in self._logs), strict=True
+        )
+        return np.concatenate(errors_pct), np.concatenate(std_pct)
+
+    @property
     def soc_errors_pct(self) -> FloatArray:
         """SoC errors without a correction [%]."""
-        return np.concatenate([soc_errors_pct(self._model, log) for log in self._logs])
+        return self._soc[0]
 
     def correction(self, evidence: Evidence) -> Correction:
         """Return the correction by an effect."""
@@ -145,12 +154,16 @@ class HeldOut:
         return self._judged(correction.evidence, self.soc_errors_pct, errors_with)
 
     def keeps_soc(self, correction: Correction) -> bool:
-        """Whether the SoC error does not grow for certain."""
+        """Whether the SoC error grows by no more than the standard deviation of the SoC.
+
+        A smaller growth is within what the estimator itself leaves open.
+        """
         if correction.is_of_log or not np.isfinite(self.soc_errors_pct).any():
             return True
-        after_pct = self.corrected_soc_errors_pct(correction)
-        least, _ = self.errors.growth(self.soc_errors_pct, after_pct)
-        return least <= 0.0
+        growth_pct = self.corrected_soc_errors_pct(correction) - self.soc_errors_pct
+        known = np.isfinite(growth_pct)
+        _, std_pct = self._soc
+        return bool(known.any() and growth_pct[known].mean() <= std_pct[known].mean())
 
     def _judged(
         self,
@@ -176,7 +189,7 @@ class HeldOut:
 
     def _soc_errors_pct(self, rmse_v: float, k: int, shape: Shape, size: float) -> FloatArray:
         corrected = added(self._extended, shape.effect, shape.values(size))
-        return soc_errors_pct(model_file(self._model, corrected, rmse_v), self._logs[k])
+        return soc_errors_pct(model_file(self._model, corrected, rmse_v), self._logs[k])[0]
 
 
 def model_file(given: Model, corrected: ExtendedModel, rmse_v: float) -> Model:

@@ -166,7 +166,7 @@ class Diagnosis:
         return mean_errors(self._held_out.soc_errors_pct, after)
 
     def _soc_errors_pct(self, model: Model) -> FloatArray:
-        return np.concatenate([soc_errors_pct(model, log) for log in self.rows])
+        return np.concatenate([soc_errors_pct(model, log)[0] for log in self.rows])
 
     @property
     def errors(self) -> Errors:
