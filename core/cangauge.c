@@ -363,9 +363,14 @@ static void close_block(cg_estimator *self, cg_time time_s)
     cg_real load[CG_LOADS];
     cg_real drive[CG_EFFECTS];
     cg_means means;
-    if (block->is_broken || (block->rows == 0)) {
+    if (block->rows == 0) {
+        memory->is_unseen = true;
         return;
     }
+    if (block->is_broken) {
+        return;
+    }
+    memory->is_unseen = false;
     means.counted_s = cg_mean(block->sums[0], rows);
     means.discharged_pct = cg_mean(block->sums[1], rows);
     average(&block->sums[2], rows, 4, scalars);
@@ -731,7 +736,7 @@ static uint32_t reasons_now(const cg_estimator *self, const cg_sample *sample, c
     reasons |= reason_if(std_pct > self->settings.valid_std_pct, CG_SOC_UNCERTAIN);
     reasons |= reason_if(cg_line_filled_s(&self->line) < longest_s, CG_DELAY_LINE_FILLING);
     reasons |= reason_if(time_s < memory->gap_until_s, CG_CURRENT_GAP);
-    reasons |= reason_if(isnan(sample->voltage_v) != 0, CG_VOLTAGE_MISSING);
+    reasons |= reason_if((isnan(sample->voltage_v) != 0) || memory->is_unseen, CG_VOLTAGE_MISSING);
     reasons |= reason_if(isnan(sample->temperature_c) != 0, CG_TEMPERATURE_MISSING);
     reasons |= reason_if(!memory->newton_inside, CG_VOLTAGE_OUTSIDE_MODEL);
     reasons |= reason_if(time_s < memory->contradicted_until_s, CG_INNOVATION_LARGE);
@@ -775,14 +780,13 @@ cg_estimate cg_evaluate(cg_estimator *self)
         latest->voltage_model_v = state->memory.voltage_model_v;
         latest->residual_v = state->memory.residual_v;
         latest->reasons = reasons_now(self, &state->pending, soc_pct, std_pct);
-        latest->status = status_of(latest->reasons);
         latest->samples = state->memory.samples;
     }
     cg_estimate estimate = *latest;
     if (state->is_refused) {
         estimate.reasons |= CG_IMPLAUSIBLE_INPUT;
-        estimate.status = status_of(estimate.reasons);
     }
+    estimate.status = status_of(estimate.reasons);
     return estimate;
 }
 

@@ -306,6 +306,7 @@ typedef struct {
     cg_real steps_a2;
     cg_real steps_va;
     bool is_sign_wrong;
+    bool is_unseen; /* a block had no usable voltage, and none was used since */
     cg_real newton_pct;
     cg_real newton_std_pct;
     bool newton_inside;

@@ -79,7 +79,7 @@ class Reason(enum.IntFlag):
 REASON_WORDS: Final = {
     Reason.DELAY_LINE_FILLING: "current has been observed for less than the model's longest delay",
     Reason.CURRENT_GAP: "the current was missing for too long: charge is uncertain",
-    Reason.VOLTAGE_MISSING: "the sample has no voltage",
+    Reason.VOLTAGE_MISSING: "no voltage, or none compared with the model since it was missing",
     Reason.TEMPERATURE_MISSING: "the sample has no temperature",
     Reason.VOLTAGE_OUTSIDE_MODEL: "no SoC of 0–100 % gives this voltage: the inverse is clipped",
     Reason.SOC_OUTSIDE_MODEL: "the model was not identified at this SoC and is extrapolated",

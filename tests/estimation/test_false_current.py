@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import cangauge
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import EstimateTable, run_estimator, samples_of, step_all
 from cangauge.estimation.settings import EstimatorSettings
@@ -68,6 +70,26 @@ def test_both_implementations_contradict_the_same_rows(current_a: float, least_a
     compiled = run_estimator(log, model, settings)
     np.testing.assert_array_equal(compiled.reasons, python.reasons)
     assert np.any(python.reasons & Reason.INNOVATION_LARGE)
+
+
+@pytest.mark.parametrize("make", [Estimator, make_estimator])
+def test_what_is_counted_without_a_voltage_is_valid_once_a_voltage_agrees(
+    make: Callable[..., Estimator],
+) -> None:
+    """Current and voltage change places for three minutes: 370 A are counted."""
+    assert LOG.soc_pct is not None
+    is_swapped = (LOG.time_s >= 605.0) & (LOG.time_s < 785.0)
+    current_a = np.where(is_swapped, LOG.voltage_v, LOG.current_a)
+    voltage_v = np.where(is_swapped, LOG.current_a, LOG.voltage_v)
+    swapped = replace(LOG, current_a=current_a, voltage_v=voltage_v)
+    estimator = make(MODEL, EstimatorSettings(initial_soc_pct=90.0))
+    table = step_all(estimator, samples_of(swapped))
+    after = LOG.time_s >= 605.0
+    error_pct = np.abs(table.soc_pct - LOG.soc_pct)
+    assert error_pct[after].max() > 30.0
+    is_wrong = after & (error_pct > 3.0 * table.soc_std_pct)
+    assert not np.any(table.status[is_wrong] == Status.VALID)
+    assert np.any(table.status[~after] == Status.VALID)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

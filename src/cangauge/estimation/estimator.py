@@ -317,10 +317,11 @@ class Estimator:
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
-        block = self._block.mean()
+        memory, hypotheses, block = self._memory, self.hypotheses, self._block.mean()
         if block is None:
+            memory.is_unseen |= not self._block.rows
             return
-        memory, hypotheses = self._memory, self.hypotheses
+        memory.is_unseen = False
         self._predict(
             replace(self._counter, counted_s=block.counted_s, discharged_pct=block.discharged_pct)
         )
@@ -450,7 +451,7 @@ class Estimator:
             (std_pct > self.settings.valid_std_pct, Reason.SOC_UNCERTAIN),
             (line.filled_s < line.longest_s, Reason.DELAY_LINE_FILLING),
             (time_s < memory.gap_until_s, Reason.CURRENT_GAP),
-            (math.isnan(sample.voltage_v), Reason.VOLTAGE_MISSING),
+            (memory.is_unseen or math.isnan(sample.voltage_v), Reason.VOLTAGE_MISSING),
             (math.isnan(sample.temperature_c), Reason.TEMPERATURE_MISSING),
             (not memory.newton_inside, Reason.VOLTAGE_OUTSIDE_MODEL),
             (time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
@@ -559,7 +560,7 @@ class Estimator:
         self._memory = memory = replace(before._memory, innovations=[])
         memory.mismatch_until_s = memory.coulomb_start_pct = math.nan
         memory.is_known = False
-        self._block = BlockState(before._block.number, is_broken=True)
+        self._block = replace(before._block, is_broken=True)
         self._latest, self.is_refused = latest, False
         self.online.take_over(before.online)
         if not math.isnan(latest.soc_pct):

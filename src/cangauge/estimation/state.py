@@ -82,6 +82,8 @@ class EstimatorMemory:
     steps: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     """Weight of the latest steps of the current, and their sums [V², A², V·A]."""
     is_sign_wrong: bool = False
+    is_unseen: bool = False
+    """Whether a block had no usable voltage, and none was used since."""
     newton_pct: float = math.nan
     """SoC by inverse of the voltage model at the last row [%]."""
     newton_std_pct: float = math.nan
