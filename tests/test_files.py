@@ -105,8 +105,7 @@ def test_checking_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_large_file_takes_its_size_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_files, "_PIECE_BYTES", _files.MIB)
+def test_a_large_file_takes_its_size_once(tmp_path: Path) -> None:
     path, content = tmp_path / "log.csv", os.urandom(_files.MIB) * 16
     path.write_bytes(content)
     tracemalloc.start()

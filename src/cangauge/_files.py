@@ -158,9 +158,10 @@ def _stated_bytes(file: BinaryIO, path: str | PathLike[str]) -> int:
 
 
 def _bzip2_bytes(path: str | PathLike[str]) -> int:
-    """Return the least that a bzip2 file unpacks to: what its full blocks hold, without runs.
+    """Return the least that a bzip2 file unpacks to: what its full blocks hold.
 
-    A block begins with a mark, at any bit; so does the end of a stream, whose last block is not
+    A block holds its size of bytes, in which four equal ones are written as five.
+    It begins with a mark, at any bit; so does the end of a stream, whose last block is not
     full.
     """
     full = 0
@@ -172,7 +173,7 @@ def _bzip2_bytes(path: str | PathLike[str]) -> int:
             full += sum(piece.count(mark) for mark in _BZIP2_BLOCK)
             full -= sum(piece.count(mark) for mark in _BZIP2_END)
             begin = piece[1 - len(_BZIP2_END[0]) :]
-    return full * 100_000 * int(level) if level.isdecimal() else 0
+    return full * 80_000 * int(level) if level.isdecimal() else 0
 
 
 def _too_large(path: str | PathLike[str], limit: int, what: str) -> InputError:

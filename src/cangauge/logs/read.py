@@ -146,15 +146,18 @@ class LogFile:
         try:
             return self._read(self.head, temperature_c, temperature_source)
         except UnclearMarkError as error:
-            logs = list[Log]()
+            logs = dict[str, Log]()
             for mark in (",", "."):
                 head = self.head.with_decimals(mark)
                 with suppress(InputError):
-                    logs.append(self._read(head, temperature_c, temperature_source))
+                    logs[mark] = self._read(head, temperature_c, temperature_source)
             if len(logs) != 1:
                 raise
-            remark = f"{error.field}: {error.problem}; only one of them makes a log"
-            return replace(logs[0], remarks=(*logs[0].remarks, remark))
+            ((mark, log),) = logs.items()
+            taken = "decimals" if mark in str(error.value) else "thousands"
+            remark = f"{error.field}: {error.value} is read with a mark of {taken}: the other"
+            remark += " reading makes no log"
+            return replace(log, remarks=(*log.remarks, remark))
 
     def _read(
         self,

@@ -235,11 +235,14 @@ def _are_minutes(parts: Any, unit: str, source: str, label: str) -> bool:
         return True
     if _TWO_PARTS.fullmatch(unit):
         return unit[:1].lower() == "m"
-    hours = np.nan_to_num(_numbers(parts, "h"))
+    if np.isfinite(_numbers(parts, "d")).any() or np.any(_words(parts, "half") != ""):
+        return False  # only a clock counts days, or halves of one
+    hours, minutes = _numbers(parts, "h"), _numbers(parts, "m")
+    hours, minutes = hours[np.isfinite(hours)], minutes[np.isfinite(hours)]
     if np.max(hours) < 24.0 and np.any(np.diff(hours) < 0.0):  # from 23:59 to 0:00
         return False
     problem = "it may be hours and minutes, or minutes and seconds"
-    shown = f"{hours[-1]:.0f}:{_numbers(parts, 'm')[-1]:02.0f}"
+    shown = f"{hours[-1]:.0f}:{minutes[-1]:02.0f}"
     cure = f"state it: --columns 'time={label}[h:mm]', or [mm:ss]"
     raise InputError(problem, source=source, field=label, value=shown, cure=cure)
 
@@ -281,6 +284,8 @@ def changes_of_clock(dates_s: FloatArray, source: str, label: str, cure: str) ->
         known_s = known_s[::-1]
     step = np.diff(known_s)
     usual_s = float(np.median(step))
+    if usual_s > LIMITS["interval_s"]:  # a slow series of a long table: an hour tells nothing
+        return []
     remarks = []
     for row in np.flatnonzero(np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s):
         date = np.datetime64(int(known_s[row]), "s").item()

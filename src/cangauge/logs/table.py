@@ -80,14 +80,19 @@ class ArrowTable:
     units: Sequence[str] = ()
     remarks: list[str] = field(default_factory=list)
 
-    def columns(self, places: Sequence[int], apart: Collection[int] = ()) -> dict[int, Any]:
+    def columns(
+        self,
+        places: Sequence[int],
+        apart: Collection[int] = (),
+        optional: Collection[int] = (),
+    ) -> dict[int, Any]:
         """Return columns by place; raise InputError if another column has one of their names."""
         names = [self.headings[place] for place in places]
         for name in names:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
-        return read_cells(columns, self.headings, self.source, apart=apart)
+        return read_cells(columns, self.headings, self.source, apart=apart, optional=optional)
 
 
 def draft_of_table(
@@ -114,7 +119,7 @@ def draft_of_table(
     unit_columns = {k: k + 1 for k in taken if _UNITS.search("".join(headings[k + 1 : k + 2]))}
     counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, taken)
     wanted = dict.fromkeys([*taken, *unit_columns.values(), *counters])
-    cells = table.columns([*wanted], apart=times)
+    cells = table.columns([*wanted], apart=times, optional=[*counters])
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     units = {place: _only_word(cells[k], where, headings[k]) for place, k in unit_columns.items()}
     for quantity, column in chosen.items():
@@ -248,7 +253,7 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         for place, text in enumerate(headings)
         if headings.count(text) == 1 and _STATES.search(text.lower())
     ]
-    for place, column in table.columns(places).items() if places else ():
+    for place, column in table.columns(places, optional=places).items() if places else ():
         cells = pc.fill_null(pc.utf8_lower(column.cast(pa.string())), "")
         flag = parse_heading(headings[place])
         ways = [_CHARGES, _DISCHARGES]

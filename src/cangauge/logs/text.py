@@ -49,7 +49,12 @@ class TextTable(NamedTuple):
     remarks: list[str]
     word: str = ""
 
-    def columns(self, places: Sequence[int], apart: Collection[int] = ()) -> dict[int, Any]:
+    def columns(
+        self,
+        places: Sequence[int],
+        apart: Collection[int] = (),
+        optional: Collection[int] = (),
+    ) -> dict[int, Any]:
         """Read columns, as `read_cells`.
 
         A cut last line and closing remarks of the exporter are left out, with a remark.
@@ -88,7 +93,8 @@ class TextTable(NamedTuple):
             self.remarks.append(f"the last line has no line end: {doubt}")
         headings = [*self.headings, *repeat("", width)]
         columns = {place: table.column(names[place]) for place in places}
-        return read_cells(columns, headings, str(self.head.path), self.head.decimal_mark, apart)
+        source, mark = str(self.head.path), self.head.decimal_mark
+        return read_cells(columns, headings, source, mark, apart=apart, optional=optional)
 
     def _parsed(
         self, data: bytes, names: list[str], types: Mapping[str, Any]

@@ -66,14 +66,17 @@ def read_cells(
     headings: Sequence[str],
     source: str | None,
     decimal_mark: str = "",
+    *,
     apart: Collection[int] = (),
+    optional: Collection[int] = (),
 ) -> dict[int, Any]:
     """Return columns of one table: text that holds numbers as these, other text trimmed.
 
     Null stands where there is no value, and where a restarted logger wrote its header again.
     Numbers are read as they are spelled (`−1'800,5 V`): what a mark means in one cell tells it in
     all others of the table, but decimal points in the columns `apart`, of times: programs write
-    them beside decimal commas. `decimal_mark` is that of a table of which no cell tells it.
+    them beside decimal commas. `decimal_mark` is that of a table of which no cell tells it. Columns
+    that are `optional` stay text if nothing tells it: no reading of the table depends on them.
 
     Raises
     ------
@@ -82,7 +85,9 @@ def read_cells(
     """
     texts = {place: each.cast(pa.string()) for place, each in columns.items() if is_text(each)}
     present = {place: _present(cells, headings[place]) for place, cells in texts.items()}
-    read = _with_decimal_points(present, headings, source, decimal_mark, apart)
+    read = _with_decimal_points(
+        present, headings, source, decimal_mark, apart=apart, optional=optional
+    )
     return {**columns, **{place: _as_numbers(cells) for place, cells in read.items()}}
 
 
@@ -146,7 +151,9 @@ def _with_decimal_points(
     headings: Sequence[str],
     source: str | None,
     decimal_mark: str,
+    *,
     apart: Collection[int],
+    optional: Collection[int],
 ) -> dict[int, Any]:
     """Return columns of text, their numbers with `-` as minus and `.` as the only mark."""
     are_clocks = {place: pc.all(pc.match_substring(texts[place], ":")).as_py() for place in texts}
@@ -160,6 +167,8 @@ def _with_decimal_points(
     of_table = of_table or {*decimal_mark}
     for place, cells in numbers.items():
         decimal = own[place] if len(own[place]) == 1 else of_table
+        if not decimal and place in optional:
+            continue
         if not decimal:
             _refuse_unclear(cells, source, headings[place])
         thousands = _MARKS[min(decimal)] if len(decimal) == 1 else "'"
