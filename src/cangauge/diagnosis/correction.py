@@ -92,9 +92,8 @@ class Correction:
 
     @property
     def is_better(self) -> bool:
-        """Whether the voltage error shrinks for certain."""
-        _, most = self.errors.growth(self.errors.before_v**2, self.errors.after_v**2)
-        return most < 0.0
+        """Whether the error of rows that did not size it is smaller with it."""
+        return self.rmse_v < rms(self.errors.before_v)
 
     @property
     def is_of_log(self) -> bool:

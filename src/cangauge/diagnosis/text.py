@@ -293,7 +293,7 @@ def _refusal(found: Diagnosis) -> str | None:
         before, after = (number(x, 2, "%") for x in found.soc_mae_pct(better))
         return f"{with_it}, the SoC error of left-out rows grows ({before} → {after})"
     change = f"{volts(rms(refused.errors.before_v))} → {volts(refused.rmse_v)}"
-    return f"{with_it}, the voltage error of left-out rows does not surely shrink ({change})"
+    return f"{with_it}, the voltage error of left-out rows does not shrink ({change})"
 
 
 def caveats(found: Diagnosis) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -71,28 +70,6 @@ class Errors:
         sums = np.bincount(self.piece, weights=values)
         draw = np.random.default_rng(0).integers(0, sums.size, (DRAWS, sums.size))
         return np.asarray(sums[draw].sum(axis=1))
-
-    def growth(self, before: FloatArray, after: FloatArray) -> tuple[float, float]:
-        """Return how much larger a mean error is after than before, as its 95 % interval.
-
-        By a bootstrap over pieces, on the rows where it changes: a step changes none before it.
-        Infinite where the errors are known on no row.
-
-        Parameters
-        ----------
-        before, after : array of shape (m,)
-            An error of each row, absolute or squared.
-        """
-        known = np.isfinite(before) & np.isfinite(after)
-        if not known.any():
-            return math.inf, math.inf
-        changed = known & (before != after)
-        if not changed.any():
-            return 0.0, 0.0
-        rows = self.drawn(changed.astype(np.float64))
-        change = self.drawn(np.where(changed, after - before, 0.0))
-        low, high = np.quantile(change[rows > 0.0] / rows[rows > 0.0], [0.025, 0.975])
-        return float(low), float(high)
 
 
 def rms(errors_v: FloatArray) -> float:
