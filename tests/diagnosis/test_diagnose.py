@@ -272,20 +272,26 @@ def test_a_wrong_start_belongs_to_the_log(known: Healthy, model: Model) -> None:
 
 
 def test_a_correction_that_makes_the_soc_worse_is_refused(known: Healthy, model: Model) -> None:
-    """The car's SoC lies where the voltage has it, except in the first row."""
+    """The car's SoC lies where the voltage has it, or little nearer to it than to the truth."""
 
-    def own_soc(log: Log) -> Log:
+    def own_soc(log: Log, beyond_pct: float) -> Log:
         assert log.soc_pct is not None
-        soc = log.soc_pct + 10.0
+        soc = log.soc_pct + beyond_pct
         soc[0] = log.soc_pct[0]
         return replace(log, soc_pct=soc)
 
     logs = [more_volts(day(seed), 5.0) for seed in (20, 21)]
-    kept, refused = (
-        judged(diagnose(each, model, known), voltage_offset=1.0)
-        for each in (logs, [own_soc(log) for log in logs])
+    kept, within, refused = (
+        judged(
+            diagnose([own_soc(log, beyond_pct) for log in logs], model, known), voltage_offset=1.0
+        )
+        for beyond_pct in (0.0, 7.0, 10.0)
     )
     assert kept.is_written
+    assert within.is_written
+    assert within.soc_errors_pct is not None
+    before_pct, after_pct = within.soc_errors_pct
+    assert before_pct < after_pct < before_pct + 1.0
     assert not refused.is_written
     assert refused.why_not is not None
     assert "the SoC error of left-out rows grows (" in refused.why_not
