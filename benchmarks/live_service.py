@@ -1,12 +1,16 @@
-"""`cangauge` commands on a bus of the benchmarks, in separate processes."""
+"""`cangauge` commands on a bus, in separate processes, and what sends to them."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from tempfile import NamedTemporaryFile
+from typing import Self
+
+import can
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress
@@ -46,3 +50,22 @@ def service(
         finally:
             process.kill()
             process.communicate()
+
+
+class Traffic(threading.Thread):
+    """Sends on buses, from the start of a block to its end."""
+
+    def __init__(self, *buses: can.BusABC) -> None:
+        super().__init__(daemon=True)
+        self._buses = buses
+        self._over = threading.Event()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+        for bus in self._buses:
+            bus.shutdown()

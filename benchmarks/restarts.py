@@ -28,7 +28,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import can
 import numpy as np
@@ -49,7 +49,7 @@ from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper
 from cangauge.settings import FrameIds
 from cangauge.types import Estimate, Reason, Sample
-from live_service import ENTRY
+from live_service import ENTRY, Traffic
 
 EVERY_S = RunConfig.model_fields["state_every_s"].default
 RATE_HZ = 10
@@ -290,28 +290,18 @@ def real_process(kills: int, seed: int, folder: Path, console: Console) -> Resul
     return found | {"refused": kills - player.restored()}
 
 
-class Player(threading.Thread):
+class Player(Traffic):
     """Sends a drive to a bus in real time and reads the SoC of two services."""
 
     def __init__(self, samples: list[Sample], log: Path) -> None:
-        super().__init__(daemon=True)
+        self._bus = open_bus(BusAddress("udp_multicast", CHANNEL, {"port": PORT}))
+        super().__init__(self._bus)
         self._samples = samples
         self._log = log
-        self._bus = open_bus(BusAddress("udp_multicast", CHANNEL, {"port": PORT}))
-        self._over = threading.Event()
         self._latest: dict[int, float] = {}
         self._readers = [SocReader(FrameIds(each, each + 1, each + 15)) for each in
                          (KILLED_ID, WHOLE_ID)]  # fmt: skip
         self.sent = 0
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self.join()
-        self._bus.shutdown()
 
     def run(self) -> None:
         """Send frames and receive in between."""

@@ -23,7 +23,6 @@ from whole_processes import (
     VEHICLE,
     YEAR_S,
     Life,
-    Traffic,
     as_root,
     clean,
     errors,
@@ -36,6 +35,7 @@ from cangauge.bus.open import BusAddress, has_socketcan
 from cangauge.extras.inverter.gateway import DOUBT_S
 from cangauge.replay.encoder import FrameEncoder
 from live import waits
+from live_service import Traffic
 
 pytestmark = [
     pytest.mark.socketcan,

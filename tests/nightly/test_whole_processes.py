@@ -26,7 +26,6 @@ from whole_processes import (
     VEHICLE,
     YEAR_S,
     Life,
-    Traffic,
     as_root,
     clean,
     errors,
@@ -46,6 +45,7 @@ from cangauge.service.state import read_state
 from cangauge.settings import FrameIds
 from cangauge.types import Sample, Status
 from live import waits
+from live_service import Traffic
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and mounts of Linux")
 HOUR_S = 3600.0

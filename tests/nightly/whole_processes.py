@@ -6,14 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
-import can
 import pytest
 
 from cangauge.bus.open import BusAddress
@@ -89,25 +87,6 @@ class Life:
     def end(self, kind: int = signal.SIGTERM) -> int:
         self.process.send_signal(kind)
         return self.process.wait(PATIENCE_S)
-
-
-class Traffic(threading.Thread):
-    """Sends on buses, from the start of a block to its end."""
-
-    def __init__(self, *buses: can.BusABC) -> None:
-        super().__init__(daemon=True)
-        self._buses = buses
-        self._over = threading.Event()
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self.join()
-        for bus in self._buses:
-            bus.shutdown()
 
 
 def clean(text: str) -> bool:
