@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import errno
 import os
 import tracemalloc
@@ -103,6 +104,14 @@ def test_a_device_is_written_and_never_replaced() -> None:
 def test_checking_leaves_nothing_behind(tmp_path: Path) -> None:
     check_writable(tmp_path / "later.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_in_bzip2_count_for_no_more_than_they_are(tmp_path: Path) -> None:
+    """A block of bzip2 holds the least where each run has four bytes."""
+    path, content = tmp_path / "log.csv", b"11112222" * _files.MIB
+    path.write_bytes(bz2.compress(content))
+    with bz2.open(path) as file:
+        assert _files.read_all(file, path, 2 * len(content), "a log") == content
 
 
 def test_a_large_file_takes_its_size_once(tmp_path: Path) -> None:

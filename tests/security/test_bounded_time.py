@@ -141,6 +141,15 @@ def test_every_reader_takes_bounded_time(content: str, tmp_path: Path) -> None:
         assert len(why) < 1000
 
 
+def test_names_of_a_long_table_take_no_time_for_each_row(tmp_path: Path) -> None:
+    rows = "2024-03-13 {:02d}:{:02d}:00,c{},1\n"
+    lines = [rows.format(k // 60 % 24, k % 60, k % PARTS) for k in range(15 * PARTS)]
+    (tmp_path / "file").write_text("".join(["time,name,value\n", *lines]))
+    began_s = time.process_time()
+    assert "no plain heading of current and voltage" in refusal(a_log, tmp_path / "file")
+    assert time.process_time() - began_s < WITHIN_S
+
+
 @pytest.mark.parametrize("reader", READERS)
 def test_a_link_to_itself_is_refused(reader: str, tmp_path: Path) -> None:
     path = tmp_path / "file"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from operator import itemgetter
 from typing import Any, Final, Self
@@ -121,8 +121,8 @@ class LongTable(Channels):
         self, names: str, label: str, how: str, by_name: dict[str, tuple[FloatArray, FloatArray]]
     ) -> None:
         self.label, self.how, self._by_name = label, how, by_name
-        repeats = [np.diff(values) == 0.0 for _, values in by_name.values()]
-        self._is_polled = bool(np.mean(np.concatenate(repeats)) > POLLED_SHARE)
+        repeats = np.concatenate([np.diff(values) == 0.0 for _, values in by_name.values()])
+        self._is_polled = bool(np.count_nonzero(repeats) > POLLED_SHARE * repeats.size)
         each = "the current" if self._is_polled else "current and voltage, which are held"
         pivoted = f"{len(by_name)} series of {names} pivoted on time"
         self.remarks = [f"a row per value: {pivoted}; a row for each value of {each}"]
@@ -187,13 +187,14 @@ class LongTable(Channels):
         names = pc.replace_substring(names, " []", "")
         names = names.combine_chunks().dictionary_encode()
         names_of = " and ".join(text.headings[place] for place in varying)
-        changes = list[str]()
-        codes = names.indices.to_numpy()
-        ordered_s = stamps_s[np.argsort(codes, kind="stable")]
-        by_code = np.split(ordered_s, np.cumsum(np.bincount(codes)))
-        for own_s in by_code if "without zone" in how else ():
-            changes += changes_of_clock(own_s, source, label, "export the times in UTC")
-        series = _by_name(names, stamps_s, values)
+        series, changes = dict[str, tuple[FloatArray, FloatArray]](), list[str]()
+        for name, rows in _rows_by_name(names):
+            own_s = stamps_s[rows]
+            if "without zone" in how:
+                changes += changes_of_clock(own_s, source, label, "export the times in UTC")
+            by_time = rows[np.argsort(own_s, kind="stable")]
+            if name and np.isfinite(values[rows]).any():
+                series[name] = stamps_s[by_time], values[by_time]
         if not series:
             problem, label = "no value is a number", text.headings[value]
             raise InputError(problem, source=source, field=label, cure="check the export")
@@ -256,17 +257,12 @@ class LongTable(Channels):
         return np.where(is_near | (not is_driving), values[place], np.nan)
 
 
-def _by_name(
-    names: Any, stamps_s: FloatArray, values: FloatArray
-) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return times and values of each series, in the order of time."""
-    order = np.argsort(stamps_s, kind="stable")
-    codes = names.indices.to_numpy()[order]
-    order = order[np.argsort(codes, kind="stable")]
+def _rows_by_name(names: Any) -> Iterator[tuple[str, IntArray]]:
+    """Yield each name of a dictionary array with its rows, in the order of the file."""
+    codes = names.indices.to_numpy()
     ends = np.cumsum(np.bincount(codes))
-    parts = zip(np.split(stamps_s[order], ends), np.split(values[order], ends), strict=True)
-    named = zip(names.dictionary.to_pylist(), parts, strict=False)  # the last part is empty
-    return {name: part for name, part in named if name and np.isfinite(part[1]).any()}
+    by_code = np.split(np.argsort(codes, kind="stable"), ends)  # none is left behind the last end
+    yield from zip(names.dictionary.to_pylist(), by_code, strict=False)
 
 
 def _time_of(text: TextTable) -> str:
