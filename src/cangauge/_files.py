@@ -235,7 +235,7 @@ class Head:
     text : bytes or None
         What is read in place of the file's content.
     decimal_mark : str
-        Mark of the decimals, where no number of a table tells it; "" if it is not known.
+        Decimal mark of a table whose numbers do not show it; "" if unknown.
 
     Raises
     ------
@@ -307,12 +307,6 @@ class Head:
         """Return the head of a text that is read in place of the file's content."""
         head = copy(self)
         head.data, head.lines, head.text = text[:HEAD_BYTES], _lines(text[:HEAD_BYTES]), text
-        return head
-
-    def with_decimals(self, mark: str) -> Self:
-        """Return the head of the same file with this mark of decimals."""
-        head = copy(self)
-        head.decimal_mark = mark
         return head
 
     def read(self) -> bytes:

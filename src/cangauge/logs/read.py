@@ -143,33 +143,32 @@ class LogFile:
         Of two readings of a mark (`3,800`), the only one that makes a log is taken.
         """
         require_temperature(temperature_c)
+        self.head.decimal_mark = ""
         try:
-            return self._read(self.head, temperature_c, temperature_source)
+            return self._read(temperature_c, temperature_source)
         except UnclearMarkError as error:
             logs = dict[str, Log]()
             for mark in (",", "."):
-                head = self.head.with_decimals(mark)
+                self.head.decimal_mark = mark
                 with suppress(InputError):
-                    logs[mark] = self._read(head, temperature_c, temperature_source)
+                    logs[mark] = self._read(temperature_c, temperature_source)
             if len(logs) != 1:
                 raise
             ((mark, log),) = logs.items()
+            self.head.decimal_mark = mark
             taken = "decimals" if mark in str(error.value) else "thousands"
             remark = f"{error.field}: {error.value} is read with a mark of {taken}: the other"
             remark += " reading makes no log"
             return replace(log, remarks=(*log.remarks, remark))
 
     def _read(
-        self,
-        head: Head,
-        temperature_c: float | None,
-        temperature_source: TemperatureSource | None,
+        self, temperature_c: float | None, temperature_source: TemperatureSource | None
     ) -> Log:
         reader = self.reader
         if reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
         try:
-            draft = reader.read(head, self.columns)
+            draft = reader.read(self.head, self.columns)
             pa.default_memory_pool().release_unused()  # the table's, before the checks take theirs
             draft.ignored = tuple(name for name in draft.ignored if name not in self.read_besides)
             return draft.log(temperature_c, temperature_source, self.sign)
@@ -191,7 +190,7 @@ class LogFile:
             return False
 
     def cells(self, time_s: FloatArray) -> CellColumns | None:
-        """Return the cell voltages beside a log in a table; None where it has none.
+        """Return the cell voltages beside the log that was read; None where a table has none.
 
         Parameters
         ----------
@@ -204,7 +203,12 @@ class LogFile:
         cells = _cells(table.headings, source)
         if len(cells) < 2:  # a single cell is its pack
             return None
-        columns = table.columns([place for place, _ in cells.values()])
+        places = [place for place, _ in cells.values()]
+        chosen = choose_columns(table.headings, table.units, self.columns).chosen
+        others = [place for column in chosen.values() for place in column.places]
+        # The other columns may prove the decimal mark of the cells.
+        wanted = dict.fromkeys([*places, *others])
+        columns = table.columns([*wanted], times=chosen["time"].places)
         each_v = [
             scale * numbers_of(columns[place], source, table.headings[place])[0]
             for place, scale in cells.values()

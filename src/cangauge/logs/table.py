@@ -79,11 +79,12 @@ class ArrowTable:
     source: str | None = None
     units: Sequence[str] = ()
     remarks: list[str] = field(default_factory=list)
+    decimal_mark: str = ""
 
     def columns(
         self,
         places: Sequence[int],
-        apart: Collection[int] = (),
+        times: Collection[int] = (),
         optional: Collection[int] = (),
     ) -> dict[int, Any]:
         """Return columns by place; raise InputError if another column has one of their names."""
@@ -92,7 +93,8 @@ class ArrowTable:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
-        return read_cells(columns, self.headings, self.source, apart=apart, optional=optional)
+        source, mark = self.source, self.decimal_mark
+        return read_cells(columns, self.headings, source, mark, times=times, optional=optional)
 
 
 def draft_of_table(
@@ -119,7 +121,7 @@ def draft_of_table(
     unit_columns = {k: k + 1 for k in taken if _UNITS.search("".join(headings[k + 1 : k + 2]))}
     counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, taken)
     wanted = dict.fromkeys([*taken, *unit_columns.values(), *counters])
-    cells = table.columns([*wanted], apart=times, optional=[*counters])
+    cells = table.columns([*wanted], times=times, optional=[*counters])
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     units = {place: _only_word(cells[k], where, headings[k]) for place, k in unit_columns.items()}
     for quantity, column in chosen.items():

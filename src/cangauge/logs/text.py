@@ -52,7 +52,7 @@ class TextTable(NamedTuple):
     def columns(
         self,
         places: Sequence[int],
-        apart: Collection[int] = (),
+        times: Collection[int] = (),
         optional: Collection[int] = (),
     ) -> dict[int, Any]:
         """Read columns, as `read_cells`.
@@ -73,7 +73,7 @@ class TextTable(NamedTuple):
             beginning, _ = self._parsed(
                 data[: data.rfind(b"\n", 0, HEAD_BYTES) + 1] or data, names, texts
             )
-            numbers = numbers_in(beginning, [names[place] for place in apart])
+            numbers = numbers_in(beginning, [names[place] for place in times])
             try:
                 table, odd_rows = self._parsed(data, names, texts | numbers)
                 is_refuted = bool(numbers) and has_spelled_numbers(table.columns)
@@ -94,7 +94,7 @@ class TextTable(NamedTuple):
         headings = [*self.headings, *repeat("", width)]
         columns = {place: table.column(names[place]) for place in places}
         source, mark = str(self.head.path), self.head.decimal_mark
-        return read_cells(columns, headings, source, mark, apart=apart, optional=optional)
+        return read_cells(columns, headings, source, mark, times=times, optional=optional)
 
     def _parsed(
         self, data: bytes, names: list[str], types: Mapping[str, Any]

@@ -28,7 +28,7 @@ _MARKS: Final = {",": ".", ".": ","}
 
 
 class UnclearMarkError(InputError):
-    """A table of which no number tells whether a mark separates thousands or decimals."""
+    """A mark may separate thousands or decimals, and no number of the table shows which."""
 
 
 def is_number(text: str) -> bool:
@@ -67,49 +67,71 @@ def read_cells(
     source: str | None,
     decimal_mark: str = "",
     *,
-    apart: Collection[int] = (),
+    times: Collection[int] = (),
     optional: Collection[int] = (),
 ) -> dict[int, Any]:
-    """Return columns of one table: text that holds numbers as these, other text trimmed.
+    """Return columns of one table: numbers in text as numbers, other text trimmed.
 
-    Null stands where there is no value, and where a restarted logger wrote its header again.
-    Numbers are read as they are spelled (`−1'800,5 V`): what a mark means in one cell tells it in
-    all others of the table, but decimal points in the columns `apart`, of times: programs write
-    them beside decimal commas. `decimal_mark` is that of a table of which no cell tells it. Columns
-    that are `optional` stay text if nothing tells it: no reading of the table depends on them.
+    Missing values, and headers repeated by a restarted logger, become null. Numbers may be spelled
+    in any way (`−1'800,5 V`). The decimal mark of a column is the one that its own numbers prove,
+    else that of the table's other columns, else `decimal_mark`. Decimal points in `times` prove
+    nothing for the others: programs write them beside decimal commas.
 
     Raises
     ------
     UnclearMarkError
-        If nothing tells whether a mark separates thousands or decimals (`3,800`).
+        If a mark may separate thousands or decimals (`3,800`). An `optional` column stays text.
     """
-    texts = {place: each.cast(pa.string()) for place, each in columns.items() if is_text(each)}
-    present = {place: _present(cells, headings[place]) for place, cells in texts.items()}
-    read = _with_decimal_points(
-        present, headings, source, decimal_mark, apart=apart, optional=optional
-    )
-    return {**columns, **{place: _as_numbers(cells) for place, cells in read.items()}}
+    texts = {
+        place: _present(cells.cast(pa.string()), headings[place])
+        for place, cells in columns.items()
+        if is_text(cells)
+    }
+    spelled = {
+        place: _spelled_alike(cells)
+        for place, cells in texts.items()
+        if not pc.all(pc.match_substring(cells, ":")).as_py()  # a column of clock times
+    }
+    texts |= spelled
+    numbers = {place: _numbers_among(cells) for place, cells in spelled.items()}
+    numbers = {place: cells for place, cells in numbers.items() if _any(cells, "[.,]")}
+    proven = {place: _decimal_marks(cells) for place, cells in numbers.items()}
+    of_table = {
+        mark
+        for place, marks in proven.items()
+        for mark in marks
+        if mark == "," or place not in times
+    }
+    for place, cells in numbers.items():
+        marks = proven[place] if len(proven[place]) == 1 else of_table or {*decimal_mark}
+        if marks:
+            thousands = _MARKS[min(marks)] if len(marks) == 1 else "'"
+            bare = pc.replace_substring(pc.replace_substring(cells, thousands, ""), ",", ".")
+            texts[place] = pc.coalesce(bare, texts[place])
+        elif place not in optional:
+            _refuse_unclear(cells, source, headings[place])
+    return {**columns, **{place: _as_numbers(cells) for place, cells in texts.items()}}
 
 
-def numbers_in(beginning: Any, apart: Collection[str] = ()) -> dict[str, Any]:
+def numbers_in(beginning: Any, times: Collection[str] = ()) -> dict[str, Any]:
     """Return the types of columns of numbers by the beginning of a table.
 
     They are then parsed without the text, which would take twice the memory of a long log. A later
-    cell that these types cannot mean fails to parse: a decimal comma, or a point where none shows
-    in the beginning that it is decimal.
+    cell of another spelling fails to parse: a decimal comma, or a point if the beginning does not
+    prove points to be decimal.
     """
     columns = dict(zip(beginning.column_names, beginning.columns, strict=True))
     bare = [name for name, cells in columns.items() if not is_text(_as_numbers(cells))]
     if has_spelled_numbers([columns[name] for name in columns.keys() - bare]):
         return {}
-    if any(_odd(columns[name], _ONE_MARK, ".") for name in bare if name not in apart):
+    if any(_odd(columns[name], _ONE_MARK, ".") for name in bare if name not in times):
         return dict.fromkeys(bare, pa.float64())
     has_points = any(_any(columns[name], "[.]") for name in bare)
     return {} if has_points else dict.fromkeys(bare, pa.int64())
 
 
 def has_spelled_numbers(columns: Sequence[Any]) -> bool:
-    """Return whether columns hold numbers that are not written as programs do (`3,8`)."""
+    """Return whether columns hold numbers with commas (`3,8`)."""
     texts = [cells for cells in columns if is_text(cells)]
     with_commas = [cells for cells in texts if pc.any(pc.match_substring(cells, ",")).as_py()]
     return any(_any(_numbers_among(_spelled_alike(cells)), "[,]") for cells in with_commas)
@@ -146,42 +168,11 @@ def _numbers_among(cells: Any) -> Any:
     return pc.if_else(is_number, cells, pa.scalar(None, pa.string()))
 
 
-def _with_decimal_points(
-    texts: Mapping[int, Any],
-    headings: Sequence[str],
-    source: str | None,
-    decimal_mark: str,
-    *,
-    apart: Collection[int],
-    optional: Collection[int],
-) -> dict[int, Any]:
-    """Return columns of text, their numbers with `-` as minus and `.` as the only mark."""
-    are_clocks = {place: pc.all(pc.match_substring(texts[place], ":")).as_py() for place in texts}
-    alike = {k: cells if are_clocks[k] else _spelled_alike(cells) for k, cells in texts.items()}
-    numbers = {k: _numbers_among(cells) for k, cells in alike.items() if not are_clocks[k]}
-    numbers = {place: cells for place, cells in numbers.items() if _any(cells, "[.,]")}
-    own = {place: _decimal_marks(cells) for place, cells in numbers.items()}
-    of_table = {
-        mark for place, marks in own.items() for mark in marks if mark == "," or place not in apart
-    }
-    of_table = of_table or {*decimal_mark}
-    for place, cells in numbers.items():
-        decimal = own[place] if len(own[place]) == 1 else of_table
-        if not decimal and place in optional:
-            continue
-        if not decimal:
-            _refuse_unclear(cells, source, headings[place])
-        thousands = _MARKS[min(decimal)] if len(decimal) == 1 else "'"
-        bare = pc.replace_substring(pc.replace_substring(cells, thousands, ""), ",", ".")
-        alike[place] = pc.coalesce(bare, alike[place])
-    return alike
-
-
 def _decimal_marks(numbers: Any) -> set[str]:
-    """Return the marks that a column shows to be decimal.
+    """Return the marks that must be decimal in a column.
 
-    A mark is decimal where it cannot separate thousands, where it follows the other mark, and where
-    the other mark stands twice.
+    A mark is decimal if its digits cannot be groups of thousands (`3,8`), if it follows the other
+    mark (`1.800,500`), or if the other mark stands twice (`1.800.500`).
     """
     return {
         mark
@@ -195,8 +186,8 @@ def _decimal_marks(numbers: Any) -> set[str]:
 def _refuse_unclear(numbers: Any, source: str | None, label: str) -> None:
     """Raise UnclearMarkError if a mark may separate thousands as well as decimals.
 
-    A point is decimal, as programs write it, but not beside a number without one where it ends in
-    0: decimals are written in all cells, or without the last zeros.
+    A point is decimal, as programs write it, unless `1.800` stands beside `950`: programs write
+    either all decimals in all cells or no trailing zeros.
     """
     has_points = _any(numbers, "[.].*0$") and _any(numbers, r"^[-+]?[1-9]\d*$")
     marked = pc.match_substring_regex(numbers, "[.,]" if has_points else "[,]")

@@ -164,7 +164,7 @@ class LongTable(Channels):
         units = [place for place, name in enumerate(lower) if name in cls._UNITS]
         label = _time_of(text)
         time = text.headings.index(label)
-        cells = text.columns([0, value, time, *named, *units], apart=[time])
+        cells = text.columns([0, value, time, *named, *units], times=[time])
         # Headers and InfluxDB's notes stand above each table.
         is_note = pc.starts_with(pc.fill_null(cells[0].cast(pa.string()), ""), "#")
         is_row = pc.and_not(pc.is_valid(cells[time]), is_note)
