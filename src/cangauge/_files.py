@@ -343,7 +343,7 @@ def _lines(data: bytes) -> tuple[str, ...]:
     if len(data) >= HEAD_BYTES:
         # The last line may be cut within a character, which would make it look like latin-1.
         data = data[: data.rfind(b"\n") + 1] or data
-    text = as_utf8(data).decode("utf-8", errors="ignore")
+    text = as_utf8(data).rstrip(b"\0").decode("utf-8", errors="ignore")
     return () if "\x00" in text else tuple(text.splitlines()[:_HEAD_LINES])
 
 

@@ -261,6 +261,19 @@ def test_cures_taken_literally_lead_to_the_truth(
     np.testing.assert_allclose(log.temperature_c, 20.0)
 
 
+# ---- a power cut
+
+
+@pytest.mark.parametrize("last", ["", f"{ROWS},1", f"{ROWS},1,360,2"])
+def test_zero_bytes_that_a_power_cut_leaves_are_omitted(tmp_path: Path, last: str) -> None:
+    head = "Time,Current,Voltage,Temp"
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join([head, *rows_of("{k},{amps},360,20"), last + "\0" * 4096]))
+    log = read_log(path)
+    assert len(log) == ROWS + (last.count(",") == head.count(","))
+    assert any("zero bytes" in remark for remark in log.remarks)
+
+
 # ---- daylight saving time
 
 

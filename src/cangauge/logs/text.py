@@ -68,6 +68,9 @@ class TextTable(NamedTuple):
         names = [f"c{place}" for place in range(width)]
         texts = {names[place]: pa.string() for place in places}
         data = as_utf8(self.head.read())
+        if data.endswith(b"\0"):
+            data = data.rstrip(b"\0")
+            self.remarks.append("zero bytes at the end omitted, as a power cut leaves them")
         is_whole = data.endswith((b"\n", b"\r"))
         try:
             beginning, _ = self._parsed(
