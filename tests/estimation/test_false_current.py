@@ -73,7 +73,7 @@ def test_both_implementations_contradict_the_same_rows(current_a: float, least_a
 
 
 @pytest.mark.parametrize("make", [Estimator, make_estimator])
-def test_what_is_counted_without_a_voltage_is_valid_once_a_voltage_agrees(
+def test_a_soc_counted_without_a_voltage_is_not_valid(
     make: Callable[..., Estimator],
 ) -> None:
     """Current and voltage change places for three minutes: 370 A are counted."""
@@ -90,6 +90,20 @@ def test_what_is_counted_without_a_voltage_is_valid_once_a_voltage_agrees(
     is_wrong = after & (error_pct > 3.0 * table.soc_std_pct)
     assert not np.any(table.status[is_wrong] == Status.VALID)
     assert np.any(table.status[~after] == Status.VALID)
+
+
+@pytest.mark.parametrize("make", [Estimator, make_estimator])
+def test_a_voltage_that_returns_counts_from_the_end_of_its_block(
+    make: Callable[..., Estimator],
+) -> None:
+    samples = [
+        each._replace(voltage_v=float("nan")) if 605.0 <= each.time_s < 785.0 else each
+        for each in samples_of(LOG)
+    ]
+    table = step_all(make(MODEL, EstimatorSettings(initial_soc_pct=90.0)), samples)
+    is_missing = (table.reasons & Reason.VOLTAGE_MISSING) != 0
+    assert np.array_equal(is_missing, (LOG.time_s >= 605.0) & (LOG.time_s < 810.0))
+    assert table.status[LOG.time_s == 810.0] == Status.VALID
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -58,6 +61,22 @@ def test_no_charge_is_lost() -> None:
         part = following
     # 20 estimators in a row: losing 100 A × 0.1 s each time would be 0.1 %.
     assert stepped(part, samples[1900:]).soc_pct == pytest.approx(whole.soc_pct, abs=1e-9)
+
+
+@pytest.mark.parametrize("make", [Estimator, make_estimator])
+@pytest.mark.parametrize("is_longer", [False, True])
+def test_a_model_of_other_loads_continues_within_a_block(
+    make: Callable[..., Estimator], is_longer: bool
+) -> None:
+    samples, data = drive(), leaf_model().model_dump()
+    data["published"]["delays_s"] = [0.0, 10.0, 70.0]
+    del data["published"]["coefficients"]["R4"]
+    models = [leaf_model(), Model.model_validate(data)]
+    settings = EstimatorSettings(initial_soc_pct=80.0)
+    before, after = (make(each, settings) for each in (reversed(models) if is_longer else models))
+    last = stepped(before, samples[:1600])  # 160 s: the block ends at 180 s
+    after.take_over(before)
+    assert stepped(after, samples[1600:]).soc_pct == pytest.approx(last.soc_pct, abs=1.0)
 
 
 def test_longer_delay_line_must_fill_first() -> None:

@@ -560,7 +560,8 @@ class Estimator:
         self._memory = memory = replace(before._memory, innovations=[])
         memory.mismatch_until_s = memory.coulomb_start_pct = math.nan
         memory.is_known = False
-        self._block = replace(before._block, is_broken=True)
+        # Without its sums: the load row of another model has another length.
+        self._block = replace(before._block, is_broken=True, sums=None)
         self._latest, self.is_refused = latest, False
         self.online.take_over(before.online)
         if not math.isnan(latest.soc_pct):
