@@ -137,6 +137,7 @@ def test_effects_by_left_out_logs_need_three(made: Path, output: tuple[str, Path
         ("part.csv -o part.csv", ["part.csv", "suffix"]),
         ("part.csv", ["part.csv", "capacity_ah", "--capacity-ah"]),
         ("none.csv", ["none.csv", "no such file"]),
+        ("none.csv --initial-soc 90 --initial-soc auto", ["--initial-soc", "2 values for 1 log"]),
     ],
 )
 def test_bad_input_gets_one_line_and_writes_nothing(

@@ -185,8 +185,10 @@ def fit_command(
     Model file and report are written together, or neither.
     """
     from cangauge.identify.fit import fit
+    from cangauge.identify.starts import given_starts
 
     starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
+    starts = given_starts(starts if len(starts) > 1 else starts[0], len(logs))
     of_equation = published.given(equation)
     check_outputs([output, report], logs)
     with progress("cangauge.identify") as show:
@@ -194,7 +196,7 @@ def fit_command(
         result = fit(
             recorded,
             capacity_ah=capacity_ah,
-            initial_soc_pct=starts if len(starts) > 1 else starts[0],
+            initial_soc_pct=starts,
             equation=equation,
             chemistry=chemistry,
             cells=cells or _cells_of(recorded[0], reading),

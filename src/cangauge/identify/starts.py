@@ -16,7 +16,7 @@ from typing import Final, Literal
 import numpy as np
 from scipy import optimize
 
-from cangauge._text import significant
+from cangauge._text import counted, significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import (
@@ -103,7 +103,7 @@ def given_starts(
         given = list(initial_soc_pct)
     if len(given) != number:
         raise InputError(
-            f"{len(given)} values for {number} logs",
+            f"{len(given)} values for {counted(number, 'log')}",
             field="--initial-soc",
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
