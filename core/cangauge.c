@@ -363,11 +363,9 @@ static void close_block(cg_estimator *self, cg_time time_s)
     cg_real load[CG_LOADS];
     cg_real drive[CG_EFFECTS];
     cg_means means;
-    if (block->rows == 0) {
-        memory->is_unseen = true;
-        return;
-    }
-    if (block->is_broken) {
+    if (block->is_broken || (block->rows == 0)) {
+        memory->is_unseen = memory->is_unseen || (block->rows == 0);
+        propagate_to_now(self); /* so that sigma grows by what the biases make of the charge */
         return;
     }
     memory->is_unseen = false;

@@ -196,7 +196,10 @@ def test_deviation_grows_between_blocks(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=65.0, noise_v=0.5, seed=4, hours=0.2)
     log = log.rows(log.time_s < 400.0)
     silent = [
-        each._replace(voltage_v=math.nan) if each.time_s > 200.0 else each
+        # Discharge alone: what an unknown capacity did to the SoC, charging takes back.
+        each._replace(voltage_v=math.nan, current_a=abs(each.current_a))
+        if each.time_s > 200.0
+        else each
         for each in samples_of(log)
     ]
     table = run_estimator(silent, model, EstimatorSettings(initial_soc_pct=70.0))
@@ -231,6 +234,22 @@ def test_charge_is_counted_without_voltage_and_temperature(model: Model) -> None
     late = table.reasons[table.time_s > 900]
     assert np.all(late & Reason.VOLTAGE_MISSING)
     assert np.all(late & Reason.TEMPERATURE_MISSING)
+
+
+@pytest.mark.parametrize("make", [Estimator, make_estimator])
+def test_deviation_without_voltage_contains_an_unknown_capacity(
+    model: Model, make: Callable[..., Estimator]
+) -> None:
+    """A quarter of an hour at 100 A: 10 % of the charge (`health.CAPACITY_STD`) are unknown."""
+    estimator = make(model, EstimatorSettings(initial_soc_pct=90.0))
+    ocv_v = float(model.voltage_model().pseudo_ocv([90.0])[0])
+    for second in range(300):
+        seen = estimator.step(Sample(float(second), 0.0, ocv_v, 23.0))
+    for second in range(300, 1200):
+        unseen = estimator.step(Sample(float(second), 100.0, math.nan, 23.0))
+    charge_pct = seen.soc_pct - unseen.soc_pct
+    assert charge_pct > 40.0
+    assert unseen.soc_std_pct > 0.1 * charge_pct
 
 
 def test_time_that_does_not_increase_is_refused(model: Model) -> None:

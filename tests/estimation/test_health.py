@@ -139,7 +139,8 @@ def test_nothing_is_learned_without_charge_or_voltage() -> None:
     silent = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=80.0))
     for second in range(1200):
         silent.update(Sample(float(second), 60.0, math.nan, 23.0))
-    assert silent.health == make_estimator(MODEL).health
+    # The prior grows by its random walk alone.
+    assert silent.health == pytest.approx(make_estimator(MODEL).health, rel=1e-4)
 
 
 @pytest.mark.parametrize("wrong", [1.05, 1.1])

@@ -320,6 +320,7 @@ class Estimator:
         memory, hypotheses, block = self._memory, self.hypotheses, self._block.mean()
         if block is None:
             memory.is_unseen |= not self._block.rows
+            self._predict_to_now()  # so that σ grows by what the biases make of the charge
             return
         memory.is_unseen = False
         self._predict(

@@ -11,8 +11,8 @@ changing its state: with V = ∂x/∂b, G = ∂(S counted)/∂b and D = ∂U/∂
 
 The optimal estimate of the augmented problem is x + V b with covariance P + V Pb Vᵀ. Health is read
 from it. The published SoC is x, which counts with the stated capacity; its variance contains the
-square of V b. The form is linear: from a reference capacity that is 10 % wrong, the capacity of a
-recorded cell is learned to 1.6 %.
+mean square of that error, (V b)² + V Pb Vᵀ. The form is linear: from a reference capacity that is
+10 % wrong, the capacity of a recorded cell is learned to 1.6 %.
 
 References
 ----------
