@@ -3,8 +3,9 @@
     make faults
     PYTHONPATH=benchmarks python -m faults [--only NAME]… [--bus udp|vcan|both]
 
-Says first how long it takes, then each verdict as it falls, and the table at the end; writes each
-row to `out/faults/BUS.jsonl`. Exit status 1 if a fault failed, or if no run could be judged.
+Prints the estimated time first, each verdict as soon as it is known, and the table at the end.
+Writes each row to `out/faults/BUS.jsonl`. Exit status 1 if a fault failed, or if no run could be
+judged.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def read_beginning(file: io.BufferedReader, size: int) -> bytes:
 def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the rest of an open file; raise InputError if it has more than `limit` bytes.
 
-    A bzip2 file may have half of them: it is unpacked at half the speed of the others, at best.
+    The limit of a bzip2 file is half as large, because it unpacks at most half as fast.
     """
     if isinstance(file, bz2.BZ2File):
         limit //= 2
@@ -158,11 +158,11 @@ def _stated_bytes(file: BinaryIO, path: str | PathLike[str]) -> int:
 
 
 def _bzip2_bytes(path: str | PathLike[str]) -> int:
-    """Return the least that a bzip2 file unpacks to: what its full blocks hold.
+    """Return the least size that a bzip2 file can have when unpacked.
 
-    A block holds its size of bytes, in which four equal ones are written as five.
-    It begins with a mark, at any bit; so does the end of a stream, whose last block is not
-    full.
+    A full block of level n has n × 100,000 bytes, with a count behind every four equal ones: it
+    unpacks to 80 % of them or more. Blocks and ends of streams begin with a mark, at any bit. The
+    last block of a stream is not full.
     """
     full = 0
     with Path(path).open("rb") as packed:

@@ -67,7 +67,7 @@ def test_the_reading_that_is_taken_is_said(tmp_path: Path) -> None:
         lambda k: f"{k};{round(100 * math.sin(k / 7))};3,{800 + k};25",
     )
     assert log.voltage_v[0] == pytest.approx(3.8)
-    assert any("is read with a mark of thousands" in remark for remark in log.remarks)
+    assert any("the mark in 3,800 separates thousands" in remark for remark in log.remarks)
 
 
 def test_parquet_is_read_like_csv(tmp_path: Path) -> None:

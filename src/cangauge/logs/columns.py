@@ -90,7 +90,7 @@ class UnknownColumnsError(InputError):
     def proposing(self, can_read: Callable[[ColumnMap], bool]) -> InputError:
         """Return the error with the columns to paste, if any columns read the file.
 
-        A quantity of which several columns do has a `?`, and so has one without a likely column.
+        A quantity has a `?` if several of its columns read the file, or if none is likely.
 
         Parameters
         ----------
@@ -227,7 +227,7 @@ def refuse_doubled(name: str, names: Sequence[str], source: str | None) -> None:
 def _choose(
     quantity: str, found: Sequence[_Found], headings: Sequence[str], choice: Choice
 ) -> None:
-    """Choose among the columns of a quantity, the most direct of which is first; or guess."""
+    """Choose among the columns of a quantity, the most direct first; or guess."""
     _, first = found[0]
     best = [item for item in found if item[1].rank == first.rank]
     is_sure = len(best) == 1

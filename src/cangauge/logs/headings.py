@@ -49,7 +49,7 @@ _PHRASES: Final = [
     for phrase in quantity.phrases
 ]
 _SOURCES: Final[dict[TemperatureSource, str]] = {"cell": "cell", "room": "ambient", "pack": "pack"}
-"""Words that tell where a temperature is measured."""
+"""Words for the place where a temperature is measured."""
 _UNKNOWN: Final[TemperatureSource] = "unknown"
 _NO_UNITS: Final = frozenset({"1", "-", "d"})
 """Units that end a heading as other than a unit: `Sensor 1`."""
@@ -274,7 +274,7 @@ def _measured(quantity: str, unit: str, words: set[str]) -> Meaning:
     is_numbered = len(named) < len(words)
     is_extreme = bool(named & WORDS["extreme"])
     is_other, source = "12" in words, _UNKNOWN
-    # One of several values of the pack; and one of which only a word for the pack says that.
+    # A number makes it one of several values; above 1, only a word for the pack makes it sure.
     is_part, is_vague = is_numbered, is_numbered and "1" not in words
     if quantity == "temperature":
         sources = (place for place, group in _SOURCES.items() if named & WORDS[group])

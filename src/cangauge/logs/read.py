@@ -75,7 +75,7 @@ class LogTableReader:
         )
 
     def table(self, head: Head, columns: ColumnMap | None) -> TextTable | ArrowTable:
-        """Return the table, of which only the headings are read yet."""
+        """Return the table; only its headings are read."""
         is_parquet = head.data.startswith(_PARQUET)
         table = parquet_table(head) if is_parquet else find_table(head, columns)
         if table is None:
@@ -140,7 +140,7 @@ class LogFile:
     ) -> Log:
         """Read the log; arguments and errors as of `cangauge.read_log`.
 
-        Of two readings of a mark (`3,800`), the only one that makes a log is taken.
+        If a mark is unclear (`3,800`) and only one reading of it makes a log, it is taken.
         """
         require_temperature(temperature_c)
         self.head.decimal_mark = ""
@@ -157,8 +157,8 @@ class LogFile:
             ((mark, log),) = logs.items()
             self.head.decimal_mark = mark
             taken = "decimals" if mark in str(error.value) else "thousands"
-            remark = f"{error.field}: {error.value} is read with a mark of {taken}: the other"
-            remark += " reading makes no log"
+            remark = f"{error.field}: the mark in {error.value} separates {taken}"
+            remark += "; the other reading makes no log"
             return replace(log, remarks=(*log.remarks, remark))
 
     def _read(

@@ -284,7 +284,7 @@ def changes_of_clock(dates_s: FloatArray, source: str, label: str, cure: str) ->
         known_s = known_s[::-1]
     step = np.diff(known_s)
     usual_s = float(np.median(step))
-    if usual_s > LIMITS["interval_s"]:  # a slow series of a long table: an hour tells nothing
+    if usual_s > LIMITS["interval_s"]:  # in a slow series an hour may simply have passed
         return []
     remarks = []
     for row in np.flatnonzero(np.abs(np.abs(step - usual_s) - HOUR_S) <= usual_s):

@@ -45,7 +45,7 @@ from cangauge.logs.text import TextTable
 from cangauge.logs.values import first_text, is_number, numbers_of, read_cells
 
 MAX_COUNTERS: Final = 6
-"""Most columns in Ah of which one is looked for that counts the charge [-]."""
+"""Most columns in Ah among which the one that counts the charge is searched [-]."""
 HOLD_S: Final = 1.0
 """Longest time over which a voltage is held or interpolated to a row with a current [s], where each
 channel has times of its own: a bus repeats both within it."""
@@ -53,7 +53,7 @@ _STATES: Final = re.compile(
     r"(?<![a-z])(?:state|status|md|mode|direction|dir|type|step|command|(?:dis)?charg(?:e|ing))"
     "(?![a-z])|状态|类型"
 )
-"""Words of a heading that may tell the direction of an unsigned current."""
+"""Words of a heading whose cells may state the direction of an unsigned current."""
 _UNITS: Final = re.compile(r"(?:^|[^a-z])(?:units?|einheit|unité)$", re.IGNORECASE)
 """Heading of a column that states the unit of the one before it."""
 _CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])|充"
@@ -234,7 +234,7 @@ def _discharge_less_charge(draft: DraftLog, parts: Sequence[FloatArray]) -> Floa
 
 
 def _direct(draft: DraftLog, column: ChosenColumn, table: TextTable | ArrowTable) -> None:
-    """Note what tells the sign of current; a negative factor and a pair of directions do."""
+    """Leave the sign of current to the data, unless a negative factor or two columns define it."""
     if column.factor > 0.0 and len(column.places) == 1:
         draft.sign_by = "data"
         if not np.any(draft.values["current_a"] < 0.0):
@@ -247,7 +247,7 @@ def direct_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
     Raises
     ------
     InputError
-        If the words do not tell the direction of each current.
+        If the words do not state the direction of each current.
     """
     current, headings = draft.values["current_a"], [*draft.headings]
     places = [
@@ -364,7 +364,7 @@ def _hold_changes(draft: DraftLog) -> None:
     for name in values.keys() - draft.values.keys():
         rows = _latest(time + values[name], at)
         draft.values[name] = values[name][rows]
-        if name != "temperature_c":  # of which the first value is taken before it
+        if name != "temperature_c":  # its first value also holds before it
             draft.values[name][rows > at] = np.nan
     draft.remarks.append(
         f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"

@@ -204,7 +204,7 @@ def headed(head: Head, rows: int) -> Iterator[TextTable]:
 
 
 def _above_data(table: TextTable, choice: Choice, given: ColumnMap | None) -> TextTable:
-    """Return a table less the rows above its data, of which one may hold units.
+    """Return a table without the rows above its data; one of them may hold units.
 
     A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
     Below canonical names, it repeats their units; any other row is data.

@@ -20,7 +20,6 @@ _NUMBER: Final = r"^[-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?\s*\D{0,4}$"
 _SPELLINGS: Final = (("[\u2212\u2013]", "-"), ("['\u2019\u00a0\u202f](\\d{3})", r"\1"))
 """A typographic minus; 1'800."""
 _THOUSANDS: Final = r"^[-+]?[1-9]\d{{0,2}}(?:[{}]\d{{3}})+\D{{0,5}}$"
-_ONE_MARK: Final = r"^[^.,]*[{}][^.,]*$"
 _DATE: Final = r"^\d{1,4}\.\d{1,2}\.\d{1,4}$"
 """`13.03.2024` has no decimal mark."""
 _MARKS: Final = {",": ".", ".": ","}
@@ -43,7 +42,7 @@ def is_number(text: str) -> bool:
 def typical(values: FloatArray) -> float:
     """Return the median of at most 20,000 evenly spaced values of shape (n,), 0 of none.
 
-    It tells the unit of a column. That of all values takes as long as reading them.
+    It shows the unit of a column. The median of all values takes as long as reading them.
     """
     sample = values[:: 1 + values.size // 10_000]
     return float(np.median(sample)) if sample.size else 0.0
@@ -124,7 +123,7 @@ def numbers_in(beginning: Any, times: Collection[str] = ()) -> dict[str, Any]:
     bare = [name for name, cells in columns.items() if not is_text(_as_numbers(cells))]
     if has_spelled_numbers([columns[name] for name in columns.keys() - bare]):
         return {}
-    if any(_odd(columns[name], _ONE_MARK, ".") for name in bare if name not in times):
+    if any(_is_no_thousands(columns[name], ".") for name in bare if name not in times):
         return dict.fromkeys(bare, pa.float64())
     has_points = any(_any(columns[name], "[.]") for name in bare)
     return {} if has_points else dict.fromkeys(bare, pa.int64())
@@ -177,7 +176,7 @@ def _decimal_marks(numbers: Any) -> set[str]:
     return {
         mark
         for mark, other in _MARKS.items()
-        if _odd(numbers, _ONE_MARK, mark)
+        if _is_no_thousands(numbers, mark)
         or _any(numbers, rf"[{other}][^{other}]*[{mark}][^{mark}{other}]*$")
         or _any(numbers, rf"[{other}]\d{{3}}[{other}]")
     }
@@ -195,7 +194,7 @@ def _refuse_unclear(numbers: Any, source: str | None, label: str) -> None:
     if len(unclear):
         text = unclear[0].as_py()
         plain = re.sub("[.,]", "", text)
-        problem = f"it may be {text.replace(',', '.')} or {plain}: all marks have three digits"
+        problem = f"it may be {text.replace(',', '.')} or {plain}: three digits follow each mark"
         cure = "export the numbers without marks of thousands, with a decimal point"
         raise UnclearMarkError(problem, source=source, field=label, value=text, cure=cure)
 
@@ -204,9 +203,9 @@ def _any(cells: Any, pattern: str) -> bool:
     return bool(pc.any(pc.match_substring_regex(cells, pattern)).as_py())
 
 
-def _odd(cells: Any, pattern: str, mark: str) -> bool:
-    """Return whether a mark stands as in a pattern where it cannot separate thousands."""
-    has_mark = pc.match_substring_regex(cells, pattern.format(mark))
+def _is_no_thousands(cells: Any, mark: str) -> bool:
+    """Return whether the only mark of a cell cannot separate thousands (`3,8`, `0,800`)."""
+    has_mark = pc.match_substring_regex(cells, rf"^[^.,]*[{mark}][^.,]*$")
     fits = pc.match_substring_regex(cells, _THOUSANDS.format(mark))
     return bool(pc.any(pc.and_not(has_mark, fits)).as_py())
 

@@ -184,13 +184,13 @@ class Gateway(Output):
                 self._hand_on(frame, self._battery)
 
     def _is_current(self, frame: can.Message, bus: ReconnectingBus) -> bool:
-        """Return whether a frame has just come; else it waited, since this process was stopped.
+        """Return whether a frame is recent: it is not if it came while this process was stopped.
 
-        The limits that a battery allowed long ago are no limits, and the next ones follow at once.
-        Asked for each frame: the process may be stopped between two of them.
+        The battery may have lowered its limits since, and sends the next frames at once. The
+        process may stop between two frames, so that each one is checked.
         """
-        is_of_this_clock = bus.address.stamps != "driver"
-        if not is_of_this_clock or time.time() - frame.timestamp <= DOUBT_S:
+        has_other_clock = bus.address.stamps == "driver"
+        if has_other_clock or time.time() - frame.timestamp <= DOUBT_S:
             return True
         text = f"frames of {bus.name} that had waited longer than {DOUBT_S} s are dropped"
         emit(_LOG, logging.WARNING, "inverter.late", text)
