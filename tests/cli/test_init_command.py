@@ -105,8 +105,9 @@ def test_a_dbc_gives_signals_by_name_and_their_sign_is_proven(
 
 def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path) -> None:
     without = in_process("init", mitsubishi, "-o", tmp_path / "without", *CHOICE)
-    assert "SoC: open, so the map has none" in without.err
+    assert "SoC: no candidate is certain, so the map has none" in without.err
     done = in_process("init", mitsubishi, "-o", tmp_path, *CHOICE, "--choose", "soc=1")
+    assert "SoC: it stands still in at least one half of the capture" in done.err  # 45 … 45.4 %
     assert "1 ?" in done.out
     assert "1 ✓" not in done.out
     assert "V at 0.1 V a step of 16 bits (about" in done.err

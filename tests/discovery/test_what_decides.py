@@ -232,14 +232,27 @@ def test_what_falls_with_time_is_no_soc() -> None:
     assert any("no SoC field found" in remark for remark in still.remarks)
 
 
-def test_a_soc_whose_bits_are_open_is_left_to_the_user(tmp_path: Path) -> None:
+def with_open_soc(amps: np.ndarray) -> dict[int, list[np.ndarray]]:
+    """Return a pair and a SoC: either byte beside the one that moves may be its upper one."""
+    low, one = soc_of(amps) % 256, np.ones(len(amps), dtype=int)
+    return {0x100: pair_of(amps), 0x102: [one + 256 * low, 2 * one]}  # 512 or 256 steps more
+
+
+def soc_of(amps: np.ndarray) -> np.ndarray:
+    return raw(90.0 - 100.0 * np.cumsum(amps) * 0.1 / 3600.0 / 20.0, 0.1)
+
+
+def test_a_soc_is_open_also_if_its_other_reading_is_not_shown() -> None:
     amps = load(1)
-    low = raw(90.0 - 100.0 * np.cumsum(amps) * 0.1 / 3600.0 / 20.0, 0.1) % 256
-    one = np.ones(len(amps), dtype=int)
-    words = pair_of(amps)
-    # Either byte beside the one that moves may be its upper one: 512 or 256 steps more.
-    capture = frames({0x100: words, 0x102: [one + 256 * low, 2 * one]})
-    write(tmp_path, capture, {})
+    # Two other fields are as probable as the first reading.
+    found = search(frames({**with_open_soc(amps), 0x104: [soc_of(amps)], 0x106: [soc_of(amps)]}))
+    shown = [each.stream.arbitration_id for each in found.candidates["soc_reference"]]
+    assert shown == [0x102, 0x104, 0x106]
+    assert "soc_reference" not in found.clear
+
+
+def test_a_soc_whose_bits_are_open_is_left_to_the_user(tmp_path: Path) -> None:
+    write(tmp_path, frames(with_open_soc(load(1))), {})
     call = ("init", tmp_path / "d.log", "-o", tmp_path / "out", "--nominal-voltage", "370")
     call += ("--choose", "current=1", "--choose", "voltage=1")
     done = in_process(*call)

@@ -330,7 +330,8 @@ def _soc_by_charge(log: Log, sign: int) -> dict[str, Any]:
     try:
         halves = [implied_capacity([part], 0.0) for part in parts]
     except InputError:
-        return {"agrees": False, "why": "it does not move, so that no charge proves it"}
+        why = "it stands still in at least one half of the capture, so the charge cannot prove it"
+        return {"agrees": False, "why": why}
     low_ah, high_ah = sorted(sign * half.capacity_ah for half in halves)
     agrees = (
         is_capacity(low_ah)
@@ -374,8 +375,8 @@ def _show(proposal: Proposal, files: Sequence[str], output: Path) -> None:
         note(f"SoC: {why}.")
     if proposal.candidates.get("soc_reference") and "soc_reference" not in proposal.chosen:
         note(
-            "SoC: open, so the map has none. Compare the ranges above with the car's display, and"
-            " take one by --choose soc=N."
+            "SoC: no candidate is certain, so the map has none. Compare the ranges above with the"
+            " car's display, and take one by --choose soc=N."
         )
     if proposal.fixed_c is not None:
         note(

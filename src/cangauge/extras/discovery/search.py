@@ -108,7 +108,7 @@ def search(
     if next(frames, None) is not None:
         remarks.append(f"ranges and steps are those of the first {duration(grid.duration_s)}")
     seen = f"{grid.duration_s:.0f} s of frames: {len(fields)} numbers of {len(streams)} ids"
-    found = {"current": current, "voltage": voltage, "soc_reference": soc}
+    found = {"current": current, "voltage": voltage, "soc_reference": soc[:SHOWN]}
     clear = [role for role in ("current", "voltage") if found[role] and _is_clear(found[role])]
     if soc and not any(each.bits & soc[0].bits for each in soc[1:]):
         clear.append("soc_reference")
@@ -141,7 +141,7 @@ def _is_clear(found: list[Candidate]) -> bool:
     # together differs by less than its saturation.
     if any(each.evidence > 0.6 * first.evidence for each in others):
         return False
-    return not others or first.score - others[0].score >= 3.0  # a likelihood ratio of 20
+    return not others or first.score - others[0].score >= ENOUGH_NATS
 
 
 def _pair(
@@ -177,14 +177,13 @@ def _socs(
     found = []
     for field in fields:
         values = grid.means(field.stream, field.raw, field.missing)[span]
-        if _falls_with(drawn_ah, values, field.step) >= ENOUGH_NATS:
-            found += _as_soc(field, values, drawn_ah, least_ah)
+        found += _as_soc(field, values, drawn_ah, least_ah)
     kept: list[Candidate] = []
     for each in sorted(found, key=attrgetter("score"), reverse=True):
         better = [other.score for other in kept if other.bits & each.bits]
         if each.score > max(better, default=-math.inf) - ENOUGH_NATS:
             kept.append(each)
-    return [each for each in kept if not each.bits & (current.bits | voltage.bits)][:SHOWN]
+    return [each for each in kept if not each.bits & (current.bits | voltage.bits)]
 
 
 def _falls_with(drawn_ah: FloatArray, values: FloatArray, step: float) -> float:
@@ -275,8 +274,10 @@ def _likeliest(readings: Sequence[Row], *, by_scale: bool) -> Row | None:
 def _as_soc(
     field: Field, values: FloatArray, drawn_ah: FloatArray, least_ah: float
 ) -> list[Candidate]:
-    """Return the readings of a field that falls with the charge: of each level the likeliest."""
+    """Return a field's readings as a SoC, of each level the likeliest; none without evidence."""
     evidence, r = _falls_with(drawn_ah, values, field.step), correlation(values, drawn_ah)
+    if evidence < ENOUGH_NATS:
+        return []
     raw_ah = float(drawn_ah.std() / (-r * values.std()))
     readings: dict[int, list[Row]] = defaultdict(list)
     for place in field.places:
