@@ -535,6 +535,17 @@ def test_the_last_digit_does_not_move_the_answer(pack: Pack, seed: int) -> None:
         assert abs(apart_pct) < 0.1 * answers[0].error_std_pct
 
 
+def test_a_fault_whose_probability_is_zero_is_left_out(pack: Pack) -> None:
+    model, logs = pack
+    # The gauge counts 1.9 times the charge: some sets of faults are less probable than any double.
+    counts = [
+        replace(log, soc_pct=log.soc_pct[0] + 1.9 * (log.soc_pct - log.soc_pct[0])) for log in logs
+    ]
+    judgement = cangauge.judge(counts, model)
+    assert min(fit.share for fit in judgement.fits) == 0.0
+    assert judgement.verdict == "off"
+
+
 def linearised(pack: Pack, monkeypatch, *stds: float) -> Linearised:
     """Return the model of a log whose only faults are offsets of the current, of one shape."""
     seen = []

@@ -59,9 +59,9 @@ def explain(chain: Chain, known: Mapping[str, float]) -> list[Fitted]:
 
 
 def _candidate(weights: Mapping[Set, FloatArray], best: Set, tried: set[Set]) -> Set | None:
-    """Return the most probable set that is not tried; None if the best is as probable.
+    """Return the most probable untried set, if it is at least as probable as the best.
 
-    Of sets that no log tells apart it is the first, whatever the last digits of their weights.
+    Weights are rounded, so that of equally probable sets the first is taken on every machine.
     """
     total = {each: round(float(np.logaddexp.reduce(of)), 6) for each, of in weights.items()}
     better = [each for each in total if each not in tried and total[each] >= total[best]]

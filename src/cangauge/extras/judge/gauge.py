@@ -85,7 +85,9 @@ def _held(shown: FloatArray, drawn: FloatArray) -> FloatArray:
     """Return the charge that moves while a value is held; at a limit, away from it."""
     held, known = np.zeros_like(shown), np.flatnonzero(np.isfinite(shown))
     edges = np.flatnonzero(np.diff(shown[known], prepend=np.nan, append=np.nan) != 0.0)
-    for low, high in pairwise(edges):
+    for low, high in pairwise(edges.tolist()):
+        if high - low < 2:  # within one row nothing moves
+            continue
         value, charge = shown[known[low]], drawn[known[low:high]]
         moved = np.ptp(charge)
         if value <= LIMIT_PCT:

@@ -116,7 +116,7 @@ class Linearised:
     def __init__(
         self, terms: Terms, theta: FloatArray, chosen: Set | None = None, varies: float = VARIES
     ) -> None:
-        self._terms, self._chain, self._n = terms, terms.chain, terms.healthy
+        self._chain, self._n = terms.chain, terms.healthy
         of = np.arange(theta.size) if chosen is None else terms.of(chosen)
         columns = [terms.columns[k] for k in of]
         self.faults, self._std = columns[self._n :], np.array([each.std for each in columns])
@@ -242,7 +242,7 @@ class Linearised:
             if np.isfinite(weight).any()
         }
 
-    def fitted(self, chosen: Sequence[int], gauge: int | None, share: float = 1.0) -> Fitted:
+    def fitted(self, chosen: Sequence[int], gauge: int, share: float = 1.0) -> Fitted:
         """Return the posterior of a set of faults of a probability at one of `GAUGES`."""
         of = [*(self._n + k for k in chosen), *range(self._n)]
         prior = Rows.prior(self._std[of[: len(chosen)]], others=self._n)
