@@ -298,6 +298,15 @@ def test_a_correction_that_makes_the_soc_worse_is_refused(known: Healthy, model:
     assert refused.why_not in refused.summary
 
 
+def test_a_correction_that_makes_the_voltage_worse_is_refused(healthy: Diagnosis) -> None:
+    found = judged(healthy, voltage_gain=1.0)
+    assert found.corrections["voltage_reading"].rmse_v > found.baseline_rmse_v
+    assert not found.is_written
+    assert found.why_not is not None
+    assert "the voltage error of left-out rows does not shrink (" in found.why_not
+    assert found.why_not in found.summary
+
+
 def test_a_step_of_resistance_is_judged_where_it_happened(known: Healthy, model: Model) -> None:
     """The model that is written has it from the first row on, and is wrong before it."""
     log = resistance_step(day(20), 0.08)
@@ -307,6 +316,7 @@ def test_a_step_of_resistance_is_judged_where_it_happened(known: Healthy, model:
         judged(diagnose([each], model, known), resistance_step=1.0) for each in (log, beyond)
     )
     assert kept.is_written
+    assert kept.extended_model.effects[-1]["parameters"]["start_s"] == 0.0
     assert kept.soc_errors_pct is not None
     assert kept.soc_errors_pct[1] < 0.5 * kept.soc_errors_pct[0]
     assert not refused.is_written
