@@ -298,21 +298,21 @@ static void set_filter_time(cg_state *state, cg_sum counted_s, cg_sum discharged
 }
 
 /* Predict the filter to a count. */
-static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
+static void propagate(cg_estimator *self, const cg_sum *counted_s, const cg_sum *discharged_pct)
 {
     const cg_memory *memory = &self->state.memory;
     cg_passed passed;
     since_filter(&self->state, &passed);
-    passed.seconds = cg_minus(counted_s, memory->filter_counted_s);
-    passed.discharged_pct = cg_minus(discharged_pct, memory->filter_discharged_pct);
+    passed.seconds = cg_minus(*counted_s, memory->filter_counted_s);
+    passed.discharged_pct = cg_minus(*discharged_pct, memory->filter_discharged_pct);
     cg_filter_predict(&self->state.filter, self->model, &passed);
-    set_filter_time(&self->state, counted_s, discharged_pct);
+    set_filter_time(&self->state, *counted_s, *discharged_pct);
 }
 
 /* The open block then lies in part before the filter's state. */
 static void propagate_to_now(cg_estimator *self)
 {
-    propagate(self, self->state.counter.counted_s, self->state.counter.discharged_pct);
+    propagate(self, &self->state.counter.counted_s, &self->state.counter.discharged_pct);
     self->state.block.is_broken = true;
 }
 
@@ -380,7 +380,7 @@ static void close_block(cg_estimator *self, cg_time time_s)
     average(block->drive, rows, model->effects, drive);
     means.load = load;
     means.drive = drive;
-    propagate(self, means.counted_s, means.discharged_pct);
+    propagate(self, &means.counted_s, &means.discharged_pct);
     const bool was_rejected = cg_filter_is_rejected(filter, model);
     cg_filter_update(filter, model, &means);
     const bool is_lost = !cg_filter_is_valid(filter, model);
