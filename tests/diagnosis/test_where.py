@@ -33,8 +33,9 @@ def test_a_log_without_error_in_most_pieces_has_finite_intervals(wrong: int) -> 
 def test_a_drawn_piece_without_rows_costs_the_closed_part_nothing() -> None:
     """Of two stretches an hour apart, most pieces between hold no row."""
     whole = errors_v(3900, 300)
-    halved = replace(whole, after_v=0.5 * whole.before_v)
-    apart = halved.rows((whole.time_s < 300.0) | (whole.time_s >= 3600.0))
+    is_kept = (whole.time_s < 300.0) | (whole.time_s >= 3600.0)
+    halved = replace(whole, after_v=0.5 * whole.before_v, log=is_kept.astype(np.intp))
+    _, apart = halved.by_log
     closed, _ = closed_part(apart, 0.1)
     assert closed is not None
     assert 0.7 < closed < 1.0

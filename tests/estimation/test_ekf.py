@@ -160,7 +160,7 @@ def test_prediction_between_blocks_equals_the_filters_own() -> None:
     filter_ = SocFilter(LinearModel(), 60.0, 5.0)
     run(filter_, voltages(5, 4))
     soc_pct, variance = filter_.soc_moments_after(17.0, 0.4, 0.02)
-    by_biases_pct2 = filter_.bias.mean_square(0)
+    by_biases_pct2 = filter_.bias.soc_error_pct2
     filter_.predict(17.0, 0.4, 0.02)
     assert soc_pct == pytest.approx(filter_.x[0], abs=1e-12)
     assert variance == pytest.approx(filter_.P[0, 0] + by_biases_pct2, abs=1e-12)

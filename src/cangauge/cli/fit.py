@@ -187,8 +187,8 @@ def fit_command(
     from cangauge.identify.fit import fit
     from cangauge.identify.starts import given_starts
 
-    starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
-    starts = given_starts(starts if len(starts) > 1 else starts[0], len(logs))
+    given = [None if each == "auto" else each for each in initial_soc or [None]]
+    starts = given_starts(given[0] if len(given) == 1 else given, len(logs))
     of_equation = published.given(equation)
     check_outputs([output, report], logs)
     with progress("cangauge.identify") as show:

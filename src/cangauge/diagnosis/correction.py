@@ -109,7 +109,7 @@ class Correction:
 
 
 class HeldOut:
-    """Logs of which one part after the other is held out, to judge what corrects a model.
+    """Logs whose parts are held out in turn, to judge corrections of a model.
 
     Parameters
     ----------
@@ -130,17 +130,12 @@ class HeldOut:
         """Without a correction."""
 
     @cached_property
-    def _soc(self) -> tuple[FloatArray, FloatArray]:
-        """SoC errors without a correction, and their standard deviations [%]."""
+    def soc(self) -> tuple[FloatArray, FloatArray]:
+        """SoC errors without a correction, and the standard deviations of the SoC [%]."""
         errors_pct, std_pct = zip(
             *(soc_errors_pct(self._model, log) for log in self._logs), strict=True
         )
         return np.concatenate(errors_pct), np.concatenate(std_pct)
-
-    @property
-    def soc_errors_pct(self) -> FloatArray:
-        """SoC errors without a correction [%]."""
-        return self._soc[0]
 
     def correction(self, evidence: Evidence) -> Correction:
         """Return the correction by an effect."""
@@ -150,18 +145,18 @@ class HeldOut:
     def corrected_soc_errors_pct(self, correction: Correction) -> FloatArray:
         """Return the SoC errors with a correction, sized without the rows that are judged [%]."""
         errors_with = partial(self._soc_errors_pct, correction.rmse_v)
-        return self._judged(correction.evidence, self.soc_errors_pct, errors_with)
+        return self._judged(correction.evidence, self.soc[0], errors_with)
 
     def keeps_soc(self, correction: Correction) -> bool:
         """Whether the SoC error grows by no more than the standard deviation of the SoC.
 
-        A smaller growth is within what the estimator itself leaves open.
+        A smaller growth is within the estimator's own uncertainty.
         """
-        if correction.is_of_log or not np.isfinite(self.soc_errors_pct).any():
+        if correction.is_of_log or not np.isfinite(self.soc[0]).any():
             return True
-        growth_pct = self.corrected_soc_errors_pct(correction) - self.soc_errors_pct
+        errors_pct, std_pct = self.soc
+        growth_pct = self.corrected_soc_errors_pct(correction) - errors_pct
         known = np.isfinite(growth_pct)
-        _, std_pct = self._soc
         return bool(known.any() and growth_pct[known].mean() <= std_pct[known].mean())
 
     def _judged(
@@ -170,9 +165,9 @@ class HeldOut:
         before: FloatArray,
         errors_with: Callable[[int, Shape, float], FloatArray],
     ) -> FloatArray:
-        """Return errors on all rows that count, each part of the logs with its size by the others.
+        """Return errors on all rows that count; the other parts of the logs size each part.
 
-        `errors_with` returns those of a log with a shape at a size.
+        `errors_with(k, shape, size)` returns the errors of log k with a shape of that size.
         """
         after = [before[self.errors.log == k] for k in range(len(self._logs))]
         for profile, judged in self._folds:

@@ -163,7 +163,7 @@ class Diagnosis:
     def soc_mae_pct(self, correction: Correction) -> tuple[float, float]:
         """Return the mean SoC errors of left-out rows without and with a correction [%]."""
         after = self._held_out.corrected_soc_errors_pct(correction)
-        return mean_errors(self._held_out.soc_errors_pct, after)
+        return mean_errors(self._held_out.soc[0], after)
 
     def _soc_errors_pct(self, model: Model) -> FloatArray:
         return np.concatenate([soc_errors_pct(model, log)[0] for log in self.rows])

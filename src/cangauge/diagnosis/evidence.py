@@ -143,7 +143,7 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
 def _shapes_in(
     logs: Sequence[LogRows], tried: Sequence[Shape], columns: IntArray
 ) -> tuple[Shape | None, ...]:
-    """Return the shape of a trial in each log, of its column there; None for −1."""
+    """Return a trial's shape in each log; None where the log has no column of it (−1)."""
     return tuple(
         None if k < 0 else tried[k].in_log(log.trace.log.duration_s)
         for log, k in zip(logs, columns.tolist(), strict=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cangauge._text import number
-from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge._typing import FloatArray, IntArray
 
 REST_C_RATE, LONG_REST_S = 0.02, 300.0
 """Current below which the pack rests [1/h], and the rest from which on what comes after it counts
@@ -52,11 +52,10 @@ class Errors:
     @property
     def by_log(self) -> list[Errors]:
         """The errors of each log."""
-        return [self.rows(self.log == k) for k in range(int(self.log[-1]) + 1)]
-
-    def rows(self, kept: BoolArray) -> Errors:
-        """Return the errors of some rows."""
-        return Errors(*(getattr(self, each.name)[kept] for each in fields(self)))
+        return [
+            Errors(*(getattr(self, each.name)[self.log == k] for each in fields(self)))
+            for k in range(int(self.log[-1]) + 1)
+        ]
 
     @cached_property
     def piece(self) -> IntArray:

@@ -256,7 +256,7 @@ class SocFilter:
         x, P = self.x, self.P
         variance = P[SOC, SOC] + 2.0 * a * P[SOC, OFFSET] + a * a * P[OFFSET, OFFSET]
         variance += DRIFT_PCT2_PER_S * seconds + variance_pct2
-        variance += self.bias.mean_square(SOC)
+        variance += self.bias.soc_error_pct2
         return float(x[SOC] + a * x[OFFSET] - discharged_pct), float(variance)
 
     @property

@@ -442,7 +442,7 @@ class Estimator:
     def _reasons(
         self, sample: Sample, implausible: Reason, soc_pct: float, std_pct: float
     ) -> Reason:
-        """Return what is to be known of an estimate [%] after a corrected sample."""
+        """Return the reason bits of an estimate [%] after a corrected sample."""
         memory, line, time_s = self._memory, self.online.delay_line, sample.time_s
         known = self.voltage_model.range
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.

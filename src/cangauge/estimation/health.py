@@ -98,9 +98,10 @@ class FriedlandBias:
         P = self.P - np.outer(Kb, PTt)
         self.P = 0.5 * (P + P.T)
 
-    def mean_square(self, state: int) -> float:
-        """Return the mean square of the error of a state, (V b)² + V P Vᵀ, in the state's unit."""
-        v = self.V[state]
+    @property
+    def soc_error_pct2(self) -> float:
+        """Mean square error of the SoC by them, (V b)² + V P Vᵀ [%²]."""
+        v = self.V[0]
         return float((v @ self.b) ** 2 + v @ self.P @ v)
 
     @property
