@@ -232,6 +232,18 @@ def test_what_falls_with_time_is_no_soc() -> None:
     assert any("no SoC field found" in remark for remark in still.remarks)
 
 
+def test_a_soc_is_found_beside_bits_of_the_voltage() -> None:
+    amps = load(1)
+    current, voltage = pair_of(amps)
+    soc = raw(90.0 - 100.0 * np.cumsum(amps) * 0.1 / 3600.0 / 20.0, 0.4)
+    payload = np.stack([voltage % 256, voltage // 256, soc, current % 256, current // 256], axis=1)
+    found = search(
+        can.Message(0.1 * row, 0x100, data=bytes(data), is_extended_id=False)
+        for row, data in enumerate(payload.tolist())
+    )
+    assert [each.name for each in found.candidates["soc_reference"]] == ["0x100 23|8@0+"]
+
+
 def with_open_soc(amps: np.ndarray) -> dict[int, list[np.ndarray]]:
     """Return a pair and a SoC: either byte beside the one that moves may be its upper one."""
     low, one = soc_of(amps) % 256, np.ones(len(amps), dtype=int)

@@ -182,12 +182,13 @@ def _socs(
     for field in fields:
         values = grid.means(field.stream, field.raw, field.missing)[span]
         found += _as_soc(field, values, drawn_ah, least_ah)
+    taken = current.bits | voltage.bits
     kept: list[Candidate] = []
     for each in sorted(found, key=attrgetter("score"), reverse=True):
         better = [other.score for other in kept if other.bits & each.bits]
-        if each.score > max(better, default=-math.inf) - ENOUGH_NATS:
+        if not each.bits & taken and each.score > max(better, default=-math.inf) - ENOUGH_NATS:
             kept.append(each)
-    return [each for each in kept if not each.bits & (current.bits | voltage.bits)]
+    return kept
 
 
 def _falls_with(drawn_ah: FloatArray, values: FloatArray, step: float) -> float:
