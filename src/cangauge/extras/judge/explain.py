@@ -34,7 +34,7 @@ def explain(chain: Chain, known: Mapping[str, float]) -> list[Fitted]:
     Raises
     ------
     InputError
-        If the best set of faults does not settle.
+        If the coefficients of the best set stay more than 1 σ from the most probable ones.
     """
     terms = Terms(chain, known)
     theta, left = _settled(terms, np.zeros(len(terms.columns)), Set(), None)
