@@ -58,12 +58,13 @@ def uncertain(value: float | None, std: float | None, unit: str = "") -> str:
     return f"{number(value, decimals)} ± {number(std, decimals, unit)}"
 
 
-def energy_text(wh: float | None, std_wh: float | None = None) -> str:
-    """Return an energy, with its standard deviation where known, in kWh from 1 kWh on."""
-    scale, unit = (1.0, "Wh") if wh is None or abs(wh) < LEAST_KWH_WH else (1e-3, "kWh")
+def energy_text(wh: float | None, std_wh: float | None) -> str:
+    """Return an energy with its standard deviation, in kWh from 1 kWh on."""
     if wh is None or std_wh is None:
-        return significant(None if wh is None else scale * wh, 3, unit)
-    return uncertain(scale * wh, scale * std_wh, unit)
+        return NONE_KNOWN
+    if abs(wh) < LEAST_KWH_WH:
+        return uncertain(wh, std_wh, "Wh")
+    return uncertain(1e-3 * wh, 1e-3 * std_wh, "kWh")
 
 
 def possible(current_a: float | None, std_a: float | None, unit: str = "") -> str:

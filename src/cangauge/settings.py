@@ -7,16 +7,12 @@ computes is imported here: help pages read this module.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, ClassVar, Final, Literal, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
-from annotated_types import Ge, Gt, Le
-from pydantic import ConfigDict, Field, FiniteFloat
-from pydantic.fields import FieldInfo
+from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter
 
 from cangauge.errors import InputError, require_number
 
@@ -78,30 +74,14 @@ def check_settings(settings: Any, table: str = "") -> None:
 
 @cache
 def _bounds_of(kind: Any) -> dict[str, tuple[float, float, float]]:
-    """Return least value, the value that it must exceed, and largest value of each field."""
-    hints = get_type_hints(kind, include_extras=True)
+    """Return least value, the value that it must exceed, and largest value of each number."""
     found = {}
-    for field in dataclasses.fields(kind):
-        low, above, high = -math.inf, -math.inf, math.inf
-        for mark in _marks(hints[field.name]):
-            if isinstance(mark, Ge):
-                low = float(mark.ge)  # type: ignore[arg-type] # all bounds are numbers
-            elif isinstance(mark, Gt):
-                low = above = float(mark.gt)  # type: ignore[arg-type]
-            elif isinstance(mark, Le):
-                high = float(mark.le)  # type: ignore[arg-type]
-        if high < math.inf:
-            found[field.name] = low, above, high
+    for name, field in TypeAdapter(kind).json_schema()["properties"].items():
+        bounds = field.get("anyOf", [field])[0]  # of an optional number the other one is null
+        if "maximum" in bounds:
+            above = bounds.get("exclusiveMinimum", -math.inf)
+            found[name] = bounds.get("minimum", above), above, bounds["maximum"]
     return found
-
-
-def _marks(hint: Any) -> Iterator[Any]:
-    """Yield the constraints in an annotation, those of the members of a union too."""
-    for part in (*getattr(hint, "__metadata__", ()), *get_args(hint)):
-        if isinstance(part, FieldInfo):
-            yield from part.metadata
-        else:
-            yield from _marks(part)
 
 
 STRICT: Final = ConfigDict(extra="forbid")

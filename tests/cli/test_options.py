@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from cangauge.cli.options import CELLS, JSON, argument, command, option
+from cangauge.cli.options import CELLS, Json, argument, command, option
 from cangauge.errors import InputError
 
 GOT: dict[str, Any] = {}
@@ -50,7 +50,7 @@ def wide_command(
     ] = None,
     cells: Annotated[int, CELLS] = 4,
     shared: Shared,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Take everything.
 

@@ -82,7 +82,7 @@ def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
         ('model = "m"\nmetod = "ekf"', "metod", "method"),
         ('model = "m"\nmethod = "magic"', "method", "magic"),
         ('model = "m"\ninitial_soc = 130', "initial_soc", "130"),
-        ('model = "m"\ninitial_soc = "full"', "initial_soc", "neither a number nor auto"),
+        ('model = "m"\ninitial_soc = "full"', "initial_soc", "must be a valid number"),
         ('model = "m"\ntimeout_s = 0', "timeout_s", "must be greater than 0"),
         ('model = "m"\n[ids]\nsoc_detail = 0x800', "ids.soc_detail", "2047"),
         ('model = "m"\ntimeout_s = nan', "timeout_s", "finite"),

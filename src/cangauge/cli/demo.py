@@ -15,7 +15,7 @@ from cangauge._extras import extra, require_extra
 from cangauge._files import make_folder, write_text_atomic
 from cangauge._resources import shared_file
 from cangauge._text import number, significant
-from cangauge.cli.options import JSON, option
+from cangauge.cli.options import Json, option
 from cangauge.cli.output import finish, note, print_table
 from cangauge.errors import CangaugeError, InputError
 
@@ -39,7 +39,7 @@ def demo_command(
     folder: Annotated[
         Path, option("--folder", "DIR", "Folder for the model and the pages.")
     ] = Path("out/demo"),
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.
 

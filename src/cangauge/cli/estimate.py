@@ -13,11 +13,11 @@ from cangauge._extras import extra
 from cangauge._files import atomic_path
 from cangauge._text import NONE_KNOWN, number, rounded, uncertain
 from cangauge.cli.options import (
-    CAPACITY_AH,
-    JSON,
     MODEL,
-    REPORT,
+    CapacityAh,
+    Json,
     ReadingOptions,
+    Report,
     argument,
     assumed_of,
     check_outputs,
@@ -84,7 +84,7 @@ def estimate_command(
             unit="%",
         ),
     ] = 1.0,
-    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
+    capacity_ah: CapacityAh = None,
     reading: ReadingOptions,
     pack: Annotated[
         Path | None,
@@ -95,8 +95,8 @@ def estimate_command(
             suffixes=(".csv", ".parquet"),
         ),
     ] = None,
-    report: Annotated[Path | None, REPORT] = None,
-    json_output: Annotated[bool, JSON] = False,
+    report: Report = None,
+    json_output: Json = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
 

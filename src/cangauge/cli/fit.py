@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge.cli.options import (
-    JSON,
-    REPORT,
+    Json,
     ReadingOptions,
+    Report,
     argument,
     assumed_of,
     check_outputs,
@@ -160,8 +160,8 @@ def fit_command(
     ] = None,
     published: PublishedOptions,
     reading: ReadingOptions,
-    report: Annotated[Path | None, REPORT] = None,
-    json_output: Annotated[bool, JSON] = False,
+    report: Report = None,
+    json_output: Json = False,
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
 

@@ -15,10 +15,10 @@ from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge.cli.options import (
     ALARM,
-    CAPACITY_AH,
-    JSON,
-    REPORT,
+    CapacityAh,
+    Json,
     ReadingOptions,
+    Report,
     argument,
     assumed_of,
     check_outputs,
@@ -63,7 +63,7 @@ def gap_command(
             unit="%",
         ),
     ] = None,
-    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
+    capacity_ah: CapacityAh = None,
     extended: Annotated[
         Path | None,
         option(
@@ -119,8 +119,8 @@ def gap_command(
         ),
     ] = None,
     reading: ReadingOptions,
-    report: Annotated[Path | None, REPORT] = None,
-    json_output: Annotated[bool, JSON] = False,
+    report: Report = None,
+    json_output: Json = False,
 ) -> None:
     """Diagnose the gap between a model and logs: which of nine faults, how large, what to do.
 

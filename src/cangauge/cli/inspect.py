@@ -13,9 +13,9 @@ from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import counted, duration, rounded
 from cangauge.cli.options import (
-    JSON,
-    REPORT,
+    Json,
     ReadingOptions,
+    Report,
     argument,
     assumed_of,
     check_outputs,
@@ -51,8 +51,8 @@ def inspect_command(
     ],
     *,
     reading: ReadingOptions,
-    report: Annotated[Path | None, REPORT] = None,
-    json_output: Annotated[bool, JSON] = False,
+    report: Report = None,
+    json_output: Json = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
 

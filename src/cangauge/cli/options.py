@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from cangauge.logs.column_map import ColumnMap
     from cangauge.logs.log import Log
     from cangauge.logs.read import CellColumns, LogFile
-    from cangauge.logs.sign import Sign
 
 # The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
 
@@ -113,21 +113,29 @@ CHEMISTRY: Final = option(
 CELLS: Final = option(
     "--cells", "N", "Cells in series, where no model states them.", within=(1, 2000)
 )
-CAPACITY_AH: Final = option(
-    "--capacity-ah",
-    "A",
-    "Charge from 100 to 0 %. Default: the model's, where there is one.",
-    within=(1e-3, 1e5),
-    unit="Ah",
-)
-REPORT: Final = option(
-    "--report",
-    "FILE.html|.htm",
-    "Write a report as one self-contained page.",
-    suffixes=(".html", ".htm"),
-    needs="report",
-)
-JSON: Final = option("--json", "", "Print exactly one JSON object on stdout, also for an error.")
+CapacityAh = Annotated[
+    float | None,
+    option(
+        "--capacity-ah",
+        "A",
+        "Charge from 100 to 0 %. Default: the model's, where there is one.",
+        within=(1e-3, 1e5),
+        unit="Ah",
+    ),
+]
+Report = Annotated[
+    Path | None,
+    option(
+        "--report",
+        "FILE.html|.htm",
+        "Write a report as one self-contained page.",
+        suffixes=(".html", ".htm"),
+        needs="report",
+    ),
+]
+Json = Annotated[
+    bool, option("--json", "", "Print exactly one JSON object on stdout, also for an error.")
+]
 
 
 def command(
@@ -210,7 +218,7 @@ class ReadingOptions:
         ),
     ] = None
     sign: Annotated[
-        str | None,
+        Literal["charge", "discharge"] | None,
         option(
             "--sign",
             "charge|discharge",
@@ -234,12 +242,6 @@ class ReadingOptions:
 
         return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
 
-    def given_columns(self) -> ColumnMap | None:
-        """Return the columns of `--columns`; may raise InputError."""
-        from cangauge.logs.column_map import ColumnMap
-
-        return None if self.columns is None else ColumnMap.of(self.columns, "--columns")
-
     def mapped_columns(self) -> ColumnMap | None:
         """Return the columns of the map file; may raise InputError."""
         from cangauge.bus.mapping import columns_of_map
@@ -249,10 +251,10 @@ class ReadingOptions:
     def open(self, path: Path) -> LogFile | Capture:
         """Open a log by these columns, or any recording by its content; may raise InputError."""
         from cangauge.bus.recording import open_recording
+        from cangauge.logs.column_map import ColumnMap
 
-        columns, mapped = self.given_columns(), self.mapped_columns()
-        sign = cast("Sign | None", self.sign)
-        return open_recording(path, columns=columns, mapped=mapped, sign=sign)
+        columns = None if self.columns is None else ColumnMap.of(self.columns, "--columns")
+        return open_recording(path, columns=columns, mapped=self.mapped_columns(), sign=self.sign)
 
     def note_log(self, path: Path) -> None:
         """Print on stderr that options for captures do not apply to a log."""
@@ -323,20 +325,16 @@ def note_reading(log: Log) -> None:
 def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float | None) -> None:
     """Print on stderr where a given SoC at the first row is doubtful: off the log's, a fraction.
 
-    `capacity_ah` counts a first SoC that comes later back to the first row [Ah].
+    `capacity_ah` counts a first SoC that comes later back to the first row [Ah]; None: it is taken
+    as that of the first row.
     """
-    from cangauge.logs.gaps import discharged_ah
-    from cangauge.model.coulomb_counting import DIFFERENT_PCT
+    from cangauge.model.coulomb_counting import DIFFERENT_PCT, soc_at_first_row
 
     for log in logs:
         doubts = []
-        if (first := log.first_soc()) is not None:
-            row, own_pct = first
-            if row and capacity_ah is not None:
-                out_ah = discharged_ah(log.time_s[: row + 1], log.current_a[: row + 1])[-1]
-                own_pct += 100.0 * float(out_ah) / capacity_ah
-            if abs(own_pct - initial_soc_pct) >= DIFFERENT_PCT:
-                doubts.append(f"its own SoC is {own_pct:.1f} %")
+        own_pct = soc_at_first_row(log, capacity_ah or math.inf)
+        if own_pct is not None and abs(own_pct - initial_soc_pct) >= DIFFERENT_PCT:
+            doubts.append(f"its own SoC is {own_pct:.1f} %")
         if 0.0 < initial_soc_pct <= 1.0:
             doubts.append(f"a fraction is given in percent, as {100.0 * initial_soc_pct:g}")
         if doubts:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cangauge._text import duration, number
 from cangauge.cli.options import (
-    JSON,
+    Json,
     ReadingOptions,
     argument,
     assumed_of,
@@ -75,7 +75,7 @@ def replay_command(
     loop: Annotated[
         bool, option("--loop", "", "Repeat until Ctrl-C, with increasing log time.")
     ] = False,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
     **options: Any,
 ) -> None:
     """Play a recorded log or capture on a bus.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from rich.live import Live
 
 from cangauge._logging import emit
-from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
+from cangauge.cli.options import Json, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import console, emit_json, finish, print_values
 from cangauge.cli.status import live_text
 from cangauge.errors import CangaugeError
@@ -37,7 +37,7 @@ def run_command(
             " given here take precedence.",
         ),
     ] = None,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
     **options: Any,
 ) -> None:
     """Estimate the state of charge from a bus, and publish it there.
@@ -111,7 +111,7 @@ class _LiveLine(Output):
 def check_command(
     config: Annotated[Path, argument("FILE.toml", "Configuration of `cangauge run`.")],
     *,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Check a configuration as `cangauge run` would read it, without opening the bus.
 

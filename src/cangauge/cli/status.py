@@ -22,7 +22,7 @@ from cangauge._text import (
     possible,
     uncertain,
 )
-from cangauge.cli.options import JSON, option
+from cangauge.cli.options import Json, option
 from cangauge.cli.output import (
     PlainConsole,
     emit_json,
@@ -53,7 +53,7 @@ def status_command(
     watch: Annotated[
         bool, option("--watch", "", "Show it again every half second, until Ctrl-C.")
     ] = False,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], inputs, bus.
 

@@ -149,14 +149,7 @@ _NO_FILE: Final = "the configuration"
 
 
 def _none_for_auto(value: object) -> object:
-    if value == "auto":
-        return None
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            raise ValueError("neither a number nor auto") from None
-    return value
+    return None if value == "auto" else value
 
 
 class RunConfig(BaseModel):

@@ -143,25 +143,17 @@ class Notifier:
     """Notify systemd by datagrams of `KEY=value` lines; without effect where it does not listen.
 
     The environment has NOTIFY_SOCKET (a path; a leading "@" denotes the abstract namespace; whether
-    it is there is `active`), WATCHDOG_USEC and WATCHDOG_PID. `ping_every_s` is the longest interval
-    between pings of the watchdog [s]; None without one.
+    it is there is `active`).
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        given = environment or {}
-        address = given.get("NOTIFY_SOCKET", "")
+        address = (environment or {}).get("NOTIFY_SOCKET", "")
         self.active = address.startswith(("/", "@")) and hasattr(socket, "AF_UNIX")
-        self.ping_every_s: float | None = None
         if not self.active:
             return
         self._address = "\0" + address[1:] if address[0] == "@" else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setblocking(False)
-        timeout_us = given.get("WATCHDOG_USEC", "")
-        is_ours = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        # 0: no watchdog. A float, since int() refuses more than 4,300 digits.
-        if is_ours and timeout_us.isdecimal() and (seconds := float(timeout_us) / 1e6) > 0.0:
-            self.ping_every_s = seconds / 4.0  # twice as often as sd_watchdog_enabled(3) advises
 
     def __enter__(self) -> Self:
         return self

@@ -77,10 +77,7 @@ class Loop:
         reload: Callable[[], RunConfig | None] | None = None,
     ) -> None:
         self._port, self._pipeline, self._config = port, pipeline, config
-        self._takers = {
-            method: [each for each in outputs if _overrides(each, method)]
-            for method in ("on_frame", "on_sample", "on_snapshot")
-        }
+        self._outputs = list(outputs)  # those that still take news
         self._monitor = monitor or Monitor(pipeline, port)
         self._checkpoint, self._reload = checkpoint, reload
         self._published = OwnFrames(echoes=port.address.echoes)
@@ -202,7 +199,7 @@ class Loop:
             self._ask(self._poller.take(message, self._now_s))
         if not self._pipeline.handle(message):
             return False
-        if self._takers["on_sample"] or self._pipeline.is_replay:
+        if self._outputs or self._pipeline.is_replay:
             estimate = self._pipeline.latest
             self._give_sample(estimate)
             if frames := self._pipeline.replay_frames(estimate):
@@ -236,19 +233,18 @@ class Loop:
         self._give("on_sample", self._pipeline.latest_sample, estimate)
 
     def _give(self, method: str, *news: object) -> None:
-        """Call the outputs that take some news.
+        """Give the outputs some news.
 
         One that raises is called no more, and the estimate continues.
         """
-        for output in self._takers[method]:
+        for output in tuple(self._outputs):
             try:
                 getattr(output, method)(*news)
             except Exception as error:  # noqa: BLE001 - whatever it is, the SoC frames continue
                 name = type(output).__name__
                 text = f"{name} has ended: {error!r}"
                 emit(_LOG, logging.ERROR, "output.failed", text, limit=name)
-                for each, takers in self._takers.items():
-                    self._takers[each] = [taker for taker in takers if taker is not output]
+                self._outputs.remove(output)
 
     # --- estimates → frames
 
@@ -347,8 +343,3 @@ class Loop:
             self._configure()
         if self._monitor.update(now_s):
             self._give("on_snapshot", self._monitor.latest)
-
-
-def _overrides(output: Output, method: str) -> bool:
-    """Return whether an output does anything with what a method would give it."""
-    return getattr(type(output), method) is not getattr(Output, method)

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import can
 
-from cangauge._files import FULL, check_writable, is_device, written_name
+from cangauge._files import FULL, check_writable, written_name
 from cangauge._logging import emit
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
@@ -149,10 +149,8 @@ class _RecordFile:
 
     def __init__(self, base: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
         base = written_name(base) if base.is_symlink() else base
-        self._is_device = is_device(base)
-        exists = os.path.lexists(base) and not self._is_device
         self._base, self._part_bytes, self._keep_bytes = base, part_bytes, keep_bytes
-        self._in_parts = part_bytes is not None or exists
+        self._in_parts = part_bytes is not None or os.path.lexists(base)
         self._run = max((run for run, _, _ in all_parts(base)), default=0) + 1
         self._part = self._bytes = self.written_bytes = 0
         self.path = run_path(base, self._run) if self._in_parts else base
@@ -181,7 +179,7 @@ class _RecordFile:
             while left:
                 left = left[os.write(self._descriptor, left) :]
         except OSError:
-            with suppress(OSError):  # a device has no length
+            with suppress(OSError):
                 os.ftruncate(self._descriptor, self._bytes)
                 os.lseek(self._descriptor, self._bytes, os.SEEK_SET)
             raise
@@ -200,7 +198,7 @@ class _RecordFile:
         self._remove_oldest()
         self.close()
         # Made anew: another user may have made a file or a link of this name.
-        flags = os.O_WRONLY | os.O_CLOEXEC | (0 if self._is_device else os.O_CREAT | os.O_EXCL)
+        flags = os.O_WRONLY | os.O_CLOEXEC | os.O_CREAT | os.O_EXCL
         # The group may read where and how the car was driven, others not.
         self._descriptor = os.open(self.current, flags, 0o640)
         self._part, self._bytes = part, 0

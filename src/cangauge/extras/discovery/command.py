@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from cangauge._files import check_writable, make_folder, write_texts_atomic
-from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
+from cangauge.cli.options import Json, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.discovery.candidate import (
@@ -71,7 +71,7 @@ def init_command(
         option("--seconds", "S", "Time to listen to a live bus.", within=(1, 86400), unit="s"),
     ] = 60.0,
     force: Annotated[bool, option("--force", "", "Overwrite existing files.")] = False,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
     **options: Any,
 ) -> None:
     """Find the car's signals, check them against each other, and write a map and a configuration.

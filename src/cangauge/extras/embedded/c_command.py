@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cangauge.cli.options import CAPACITY_AH, CELLS, CHEMISTRY, JSON, MODEL, option
+from cangauge.cli.options import CELLS, CHEMISTRY, MODEL, CapacityAh, Json, option
 from cangauge.cli.output import finish, note
 from cangauge.errors import InputError
 
@@ -22,7 +22,7 @@ def export_c_command(
     ],
     chemistry: Annotated[Literal["oxide", "lfp"], CHEMISTRY] = "oxide",
     cells: Annotated[int | None, CELLS] = None,
-    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
+    capacity_ah: CapacityAh = None,
     platform: Annotated[
         Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"],
         option(
@@ -42,7 +42,7 @@ def export_c_command(
             unit="s",
         ),
     ] = 0.5,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller.
 

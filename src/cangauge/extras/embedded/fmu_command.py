@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cangauge.cli.options import JSON, MODEL, check_outputs, option
+from cangauge.cli.options import MODEL, Json, check_outputs, option
 from cangauge.cli.output import finish, note
 
 
@@ -25,7 +25,7 @@ def export_fmu_command(
             " σ and status out.",
         ),
     ] = "pack",
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Write a model as a functional mock-up unit (FMI 2.0, co-simulation).
 

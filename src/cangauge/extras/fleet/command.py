@@ -14,8 +14,8 @@ import typer
 
 from cangauge._text import NONE_KNOWN, number
 from cangauge.cli.options import (
-    JSON,
     MODEL,
+    Json,
     ReadingOptions,
     argument,
     check_outputs,
@@ -82,7 +82,7 @@ def fleet_command(
         ),
     ] = None,
     reading: ReadingOptions,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Estimate, diagnose or judge each of many logs: one row of a Parquet table each.
 

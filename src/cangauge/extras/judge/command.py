@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cangauge._files import write_texts_atomic
 from cangauge._text import number
 from cangauge.cli.options import (
-    CAPACITY_AH,
     CELLS,
     CHEMISTRY,
-    JSON,
     MODEL,
-    REPORT,
+    CapacityAh,
+    Json,
     ReadingOptions,
+    Report,
     argument,
     check_outputs,
     command,
@@ -39,7 +39,7 @@ def judge_command(
     model: Annotated[Path | None, MODEL] = None,
     chemistry: Annotated[Literal["oxide", "lfp"] | None, CHEMISTRY] = None,
     cells: Annotated[int | None, CELLS] = None,
-    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
+    capacity_ah: CapacityAh = None,
     output: Annotated[
         Path | None,
         option(
@@ -71,8 +71,8 @@ def judge_command(
         ),
     ] = None,
     reading: ReadingOptions,
-    report: Annotated[Path | None, REPORT] = None,
-    json_output: Annotated[bool, JSON] = False,
+    report: Report = None,
+    json_output: Json = False,
 ) -> None:
     """Judge the SoC that a battery gauge publishes: is it right, since when not, and why.
 

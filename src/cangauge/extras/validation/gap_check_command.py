@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from cangauge.cli.options import (
-    CAPACITY_AH,
     CELLS,
-    JSON,
+    CapacityAh,
+    Json,
     ReadingOptions,
     argument,
     assumed_of,
@@ -33,14 +33,14 @@ def gap_check_command(
         ),
     ] = None,
     *,
-    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
+    capacity_ah: CapacityAh = None,
     cells: Annotated[int, CELLS] = 96,
     at_most: Annotated[
         int | None,
         option("--at-most", "N", "Leave out at most this many logs.", within=(1, math.inf)),
     ] = None,
     reading: ReadingOptions,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Measure what `gap` would find: every effect injected into healthy logs of a pack.
 

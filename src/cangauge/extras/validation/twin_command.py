@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from cangauge.cli.options import JSON, check_outputs, option
+from cangauge.cli.options import Json, check_outputs, option
 from cangauge.cli.output import finish, note, print_table, progress
 
 
@@ -60,7 +60,7 @@ def twin_command(
             "leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.",
         ),
     ] = None,
-    json_output: Annotated[bool, JSON] = False,
+    json_output: Json = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
 
