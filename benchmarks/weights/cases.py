@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 from benchmarks.weights import packs
+from benchmarks.weights.outside import OUTSIDE, inject_outside
 
 from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.drive import draw_drive
-from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
+from cangauge.extras.validation.twin.faults import FAULT_KINDS, Fault, FaultKind
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
 from cangauge.extras.validation.twin.recording import record_drive, rms
@@ -56,7 +57,6 @@ EFFECTS: dict[str, tuple[str, ...]] = {
     "weak_cell": ("weak_cell",),
 }
 """Fault → its effects, drawn alike; the commonest of all, a grown resistance, twice."""
-OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
 OUTSIDE_SHARE = 0.1
 COUNTS = (1, 1, 1, 2, 2, 3, 4, 6)
 """Numbers of diagnosed logs."""
@@ -93,12 +93,18 @@ class Injection:
         if self.effect == "resistance_growth":
             gap_v = -self.size * log.current_a
             return replace(log, voltage_v=log.voltage_v + gap_v), gap_v
+        if self.effect in OUTSIDE:
+            return inject_outside(log, pack, self.effect, self.size, self.seed)
         fault = Fault(self.effect, self.size, self.shape, self.seed)
-        injected = inject(log, [fault], pack)
-        changed = injected.log
+        changed, gap_v = inject(log, [fault], pack)
         if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:
             changed = replace(changed, soc_pct=log.soc_pct)
-        return changed, injected.gap_v
+        return changed, gap_v
+
+    @property
+    def kind(self) -> FaultKind:
+        """Kind of the effect."""
+        return (FAULT_KINDS | OUTSIDE)[self.effect]
 
     def _warmer(self, log: Log, pack: TwinPack) -> tuple[Log, FloatArray]:
         """Return the log with a thermometer that reads too high."""
@@ -112,13 +118,13 @@ class Injection:
             return 0.5, 15.0
         if self.effect == "resistance_growth":
             return 0.01 * pack.resistance_ohm, 2.0 * pack.resistance_ohm
-        return fault_kind(self.effect).limits(pack)
+        return self.kind.limits(pack)
 
     def is_signed(self) -> bool:
         """Whether the size may be negative."""
         if self.effect in ("temperature_offset", "resistance_growth"):
             return self.effect == "temperature_offset"
-        return fault_kind(self.effect).signed
+        return self.kind.signed
 
 
 @dataclass
@@ -216,7 +222,7 @@ def _case(
     fault = str(rng.choice(list(EFFECTS)))
     effect = str(rng.choice(EFFECTS[fault]))
     if rng.random() < OUTSIDE_SHARE:
-        fault, effect = "unknown", str(rng.choice(OUTSIDE))
+        fault, effect = "unknown", str(rng.choice(list(OUTSIDE)))
     floors = float(np.exp(rng.uniform(*np.log(FLOORS))))
     sign, seed = float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31))
     shape = {}

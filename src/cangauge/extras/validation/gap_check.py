@@ -18,9 +18,10 @@ from cangauge._text import NONE_KNOWN, number
 from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
 from cangauge.diagnosis.text import FAULT
 from cangauge.errors import InputError
-from cangauge.extras.validation.twin.faults import Fault, fault_kinds
-from cangauge.extras.validation.twin.injection import inject, scale_injection
+from cangauge.extras.validation.twin.faults import FAULT_KINDS, Fault
+from cangauge.extras.validation.twin.injection import drive_of, inject
 from cangauge.extras.validation.twin.pack import TwinPack
+from cangauge.extras.validation.twin.recording import scale_to_gap
 from cangauge.extras.validation.twin.simulation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
@@ -111,14 +112,15 @@ def find(logs: Sequence[Log], pack: TwinPack, at_most: int | None = None) -> Ite
 def _cases(log: Log, pack: TwinPack, floor_v: float) -> Iterator[tuple[Log, Fault | None, float]]:
     """Yield a log as it is, then with every effect at each possible size [floors]."""
     yield log, None, 0.0
-    for kind in fault_kinds():
+    drive = drive_of(log, pack.capacity_ah)
+    for kind in FAULT_KINDS.values():
         shape = {"at_s": 0.4 * log.duration_s} if "at_s" in kind.shape else {}
         wanted = Fault(kind.id, -1.0 if kind.id == "initial_soc" else 1.0, shape)
         for floors in FLOORS:
-            fault, reached_v = scale_injection(log, wanted, floors * floor_v, pack)
+            fault, reached_v = scale_to_gap(pack, drive, wanted, floors * floor_v)
             if reached_v < _REACHED * floors * floor_v:
                 break  # no larger size is possible
-            yield inject(log, [fault], pack).log, fault, reached_v / floor_v
+            yield inject(log, [fault], pack)[0], fault, reached_v / floor_v
 
 
 def summarize(findings: Sequence[Finding]) -> dict[str, Any]:

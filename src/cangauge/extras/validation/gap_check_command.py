@@ -55,7 +55,7 @@ def gap_check_command(
     `cangauge gap-check --at-most 2`
     """
     from cangauge.extras.validation import gap_check
-    from cangauge.extras.validation.twin.faults import fault_kinds
+    from cangauge.extras.validation.twin.faults import FAULT_KINDS
     from cangauge.extras.validation.twin.injection import fit_surrogate_pack
 
     read = [reading.load(path) for path in logs or []]
@@ -66,7 +66,7 @@ def gap_check_command(
         raise InputError(problem, field="--capacity-ah", cure=cure)
     else:
         healthy, pack = read, fit_surrogate_pack(read, capacity_ah=capacity_ah, cells=cells)
-    each = 1 + len(gap_check.FLOORS) * len(fault_kinds())
+    each = 1 + len(gap_check.FLOORS) * len(FAULT_KINDS)
     note(f"at most {each} diagnoses of each log left out, about half a second each")
     findings = []
     with progress() as show_line:

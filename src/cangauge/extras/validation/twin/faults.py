@@ -7,23 +7,18 @@ and shape parameters (where, when, how fast) that are given or drawn from a seed
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from scipy.optimize import brentq
 
-from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.pack import TwinPack, log_uniform, read_table
 
 GAP: Final = "gap_v"
 """Parameter that replaces the size in a text: RMS gap to open [V]."""
-_TOLERANCE: Final = 0.03
-"""Relative error of the gap at which the search for a size stops [-]."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +28,7 @@ class FaultKind:
     Parameters
     ----------
     id : str
-        As in the effects library, unless `outside` it.
+        As in the effects library.
     parameter, unit : str
         Name and unit of the size.
     span : tuple of float
@@ -53,7 +48,6 @@ class FaultKind:
     span: tuple[float, float]
     times: str | None = None
     signed: bool = False
-    outside: bool = False
     shape: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
     def limits(self, pack: TwinPack) -> tuple[float, float]:
@@ -62,20 +56,14 @@ class FaultKind:
         unit = 1.0 if self.times is None else getattr(pack, self.times)
         return low * unit, high * unit
 
-
-_KINDS: Final = {name: FaultKind(name, **of) for name, of in read_table("faults.toml").items()}
-
-
-def fault_kinds(*, outside: bool = False) -> tuple[FaultKind, ...]:
-    """Return the kinds with a counterpart in the effects library, or those outside it."""
-    return tuple(kind for kind in _KINDS.values() if kind.outside is outside)
+    def draw_shape(self, seed: int) -> dict[str, float]:
+        """Draw all shape parameters."""
+        rng = np.random.default_rng(seed)
+        return {name: _draw(rng, **of) for name, of in self.shape.items()}
 
 
-def fault_kind(fault_id: str) -> FaultKind:
-    """Return a kind by its id; InputError for an unknown one."""
-    if fault_id not in _KINDS:
-        raise _refused("unknown effect", fault_id, f"use {', '.join(_KINDS)}")
-    return _KINDS[fault_id]
+FAULT_KINDS: Final = {name: FaultKind(name, **of) for name, of in read_table("faults.toml").items()}
+"""Kinds of faults by their ids."""
 
 
 @dataclass(frozen=True)
@@ -101,27 +89,12 @@ class Fault:
     @property
     def kind(self) -> FaultKind:
         """Kind of the fault."""
-        return fault_kind(self.id)
+        return FAULT_KINDS[self.id]
 
     @cached_property
     def full_shape(self) -> dict[str, float]:
         """All shape parameters, given or drawn."""
-        rng = np.random.default_rng(self.seed)
-        drawn = {name: _draw(rng, **of) for name, of in self.kind.shape.items()}
-        return {**drawn, **self.shape}
-
-    def is_active(self, time_s: FloatArray) -> BoolArray:
-        """Return where a fault that comes and goes is active, shape (n,); it starts inactive.
-
-        Its phases last `on_s` (stale frames: its size) and `off_s` on average.
-        """
-        shape = {"on_s": self.size, **self.full_shape}
-        on_s, off_s = shape["on_s"], shape["off_s"]
-        pairs = int(2.0 * float(time_s[-1] - time_s[0]) / (on_s + off_s)) + 4
-        # Drawn in pairs, so that another duration stretches the same sequence.
-        lengths = np.random.default_rng(self.seed).exponential(1.0, (pairs, 2)) * (off_s, on_s)
-        edges = time_s[0] + np.cumsum(lengths.ravel())
-        return np.asarray(np.searchsorted(edges, time_s, side="right") % 2 == 1)
+        return {**self.kind.draw_shape(self.seed), **self.shape}
 
 
 def _draw(
@@ -144,10 +117,10 @@ Faults = Mapping[str, Fault]
 
 
 def faults_by_id(faults: Iterable[Fault]) -> Faults:
-    """Return the faults of a size by id; InputError for an unknown kind, or two of one."""
+    """Return the faults of a size by id; InputError for two of one kind."""
     found: dict[str, Fault] = {}
     for fault in faults:
-        if fault.kind.id in found:
+        if fault.id in found:
             raise _refused("given twice", fault.id, "give each once")
         found[fault.id] = fault
     return {name: fault for name, fault in found.items() if fault.size}
@@ -159,48 +132,6 @@ def size_of(faults: Faults, fault_id: str) -> float:
 
 
 HEALTHY: Final[Faults] = {}
-
-
-def find_size(
-    gap_of: Callable[[Fault], float], fault: Fault, target_v: float, pack: TwinPack
-) -> tuple[Fault, float]:
-    """Return a fault of the size at which `gap_of` returns the wanted RMS gap, and that gap.
-
-    Where the physical limits of the size do not allow the wanted gap, it is the nearest.
-
-    Parameters
-    ----------
-    gap_of : callable
-        Fault → RMS gap [V]; inf if the size is impossible.
-    fault : Fault
-        Its size gives the sign.
-    target_v : float
-        RMS gap [V].
-    pack : TwinPack
-    """
-    low, high = map(math.log, fault.kind.limits(pack))
-    tried: list[tuple[float, float, float]] = []
-
-    @cache  # brentq begins at both ends again
-    def excess(log_size: float) -> float:
-        """Return the logarithm of gap over target, 0 within the tolerance."""
-        size = math.copysign(math.exp(log_size), fault.size)
-        gap_v = gap_of(replace(fault, size=size))
-        if not math.isfinite(gap_v):
-            return high - low
-        level = math.log(max(gap_v, 1e-9) / target_v)
-        tried.append((abs(level), size, gap_v))
-        return 0.0 if abs(level) < _TOLERANCE else level
-
-    if excess(high) > 0.0 > excess(low):
-        brentq(excess, low, high, xtol=0.1 * _TOLERANCE)
-    _, size, gap_v = min(tried, default=(0.0, 0.0, 0.0))
-    return replace(fault, size=size), gap_v
-
-
-def is_reached(gap_v: float, target_v: float) -> bool:
-    """Return whether a gap is the wanted one; otherwise the limits of the size prevent it."""
-    return abs(math.log(max(gap_v, 1e-9) / target_v)) < 2.0 * _TOLERANCE
 
 
 def parse_effect(text: str, pack: TwinPack, *, seed: int) -> tuple[Fault, float | None]:
@@ -229,8 +160,10 @@ def parse_effect(text: str, pack: TwinPack, *, seed: int) -> tuple[Fault, float 
     InputError
         For an unknown effect or parameter, or a value that is no number or outside its limits.
     """
-    fault_id, _, rest = text.partition(":")
-    kind = fault_kind(fault_id.strip())
+    name, _, rest = text.partition(":")
+    kind = FAULT_KINDS.get(name.strip())
+    if kind is None:
+        raise _refused("unknown effect", name, f"use {', '.join(FAULT_KINDS)}")
     _, largest = kind.limits(pack)
     ranges = {
         kind.parameter: (-largest if kind.signed else 0.0, largest),

@@ -28,11 +28,9 @@ from cangauge.extras.validation.twin.pack import (
 )
 from cangauge.extras.validation.twin.physics import lagged, simulate_truth
 from cangauge.extras.validation.twin.recording import (
-    Recording,
     measured_current,
     measured_voltage,
     read_drive,
-    scale_to_gap,
     stepped,
 )
 from cangauge.logs.gaps import discharged_ah
@@ -177,8 +175,8 @@ def _resolution(values: FloatArray) -> float:
     return 0.0
 
 
-def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> Recording:
-    """Return a recorded log as it would have been recorded with the faults.
+def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> tuple[Log, FloatArray]:
+    """Return a log as it would have been recorded with the faults, and the gap they open [V].
 
     Parameters
     ----------
@@ -203,7 +201,7 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> Recording:
         return np.interp(elapsed_s, drive.time_s, signal)
 
     changed_v = log.voltage_v + at(read.truth.voltage_v - clean.voltage_v)
-    changed_v = measured_voltage(pack, present, elapsed_s, changed_v)
+    changed_v = measured_voltage(present, changed_v)
     expected_v = log.voltage_v + at(read.expected_v - clean.voltage_v)
     changed_a = measured_current(present, elapsed_s, log.current_a)
     row, start_pct, _ = _start(log)
@@ -214,16 +212,4 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack) -> Recording:
         temperature_c=stepped(log.temperature_c + at(read.shift_k), sensors.temperature_step_k),
         soc_pct=np.where(np.arange(len(log)) == row, start_pct, np.nan),
     )
-    return Recording(
-        log=injected,
-        assumed_start_pct=start_pct,
-        true_soc_pct=100.0 * (soc_of(log, pack.capacity_ah) + at(read.truth.soc - clean.soc)),
-        expected_voltage_v=expected_v,
-        gap_v=changed_v - expected_v,
-    )
-
-
-def scale_injection(log: Log, fault: Fault, target_v: float, pack: TwinPack) -> tuple[Fault, float]:
-    """Scale a fault to an RMS gap [V] over a recorded log; its size gives the sign."""
-    drive = drive_of(log, pack.capacity_ah)
-    return scale_to_gap(pack, drive, fault, target_v, simulate_truth(pack, drive))
+    return injected, changed_v - expected_v

@@ -33,8 +33,6 @@ class Response:
 
     Parameters
     ----------
-    current_a : array
-        Current through the cells [A], positive = discharge.
     voltage_v : array
         Terminal voltage [V].
     soc : array
@@ -49,7 +47,6 @@ class Response:
         Rows until the lowest cell is empty and the car stops.
     """
 
-    current_a: FloatArray
     voltage_v: FloatArray
     soc: FloatArray
     equilibrium_v: FloatArray
@@ -105,8 +102,8 @@ def respond(
 ) -> Response:
     """Return the response to the current of a drive at known temperatures [°C], shape (n,)."""
     T, cell = core_c + KELVIN, pack.chemistry
-    I = _cell_current(drive, faults)
-    drawn = _drawn(pack, drive, faults, I)
+    I = drive.current_a
+    drawn = _drawn(pack, drive, faults)
     start = drive.start_soc + size_of(faults, "initial_soc") / 100.0
     cells, capacity, resistance, shift = _groups(pack, faults)
     z = (start + shift)[:, None] - drawn / capacity[:, None]
@@ -124,14 +121,10 @@ def respond(
     eta *= resistance[:, None]
     eta += cell.ocv(z) - cell.ocv(z - swing / capacity[:, None])
 
-    drop = cells @ eta + pack.busbar_ohm * I
-    if (dropout := faults.get("string_dropout")) is not None:
-        drop = drop * (1.0 + dropout.size * dropout.is_active(drive.time_s))
-    drop = drop + _added_drop(drive, faults, I, T)
+    drop = cells @ eta + pack.busbar_ohm * I + _added_drop(drive, faults, T)
     open_v = cells @ U0
     empty = np.flatnonzero(np.min(U0 - eta, axis=0) < cell.empty_v)
     return Response(
-        current_a=I,
         voltage_v=open_v - drop - _hysteresis(drive, faults, drawn),
         soc=start - drawn / (1.0 - size_of(faults, "capacity")),
         equilibrium_v=open_v,
@@ -142,15 +135,9 @@ def respond(
     )
 
 
-def _cell_current(drive: Drive, faults: Faults) -> FloatArray:
-    """Return the current through the cells [A]: that of the car, and of a parasitic load."""
-    if (load := faults.get("parasitic_switching")) is None:
-        return drive.current_a
-    return drive.current_a + load.size * load.is_active(drive.time_s)
-
-
-def _drawn(pack: TwinPack, drive: Drive, faults: Faults, I: FloatArray) -> FloatArray:
+def _drawn(pack: TwinPack, drive: Drive, faults: Faults) -> FloatArray:
     """Return the charge drawn from the mean cell, relative to its healthy capacity [-]."""
+    I = drive.current_a
     counted = np.where(I < 0.0, (1.0 - size_of(faults, "coulombic_efficiency")) * I, I)
     integral = np.append(0.0, np.cumsum(0.5 * (counted[1:] + counted[:-1]))) * drive.step_s
     return np.asarray(integral / 3600.0 / pack.capacity_ah)
@@ -317,14 +304,13 @@ def _soc_rise(faults: Faults, z: FloatArray) -> FloatArray | float:
     return np.asarray(rise.size / (1.0 + np.exp((z - centre) / width)))
 
 
-def _added_drop(drive: Drive, faults: Faults, I: FloatArray, T: FloatArray) -> FloatArray:
+def _added_drop(drive: Drive, faults: Faults, T: FloatArray) -> FloatArray:
     """Return the voltage drop of faults around the cells [V], shape (n,)."""
+    I = drive.current_a
     charging = 0.5 * (1.0 - I / np.hypot(I, 3.0))  # a contact that rectifies, smooth over 3 A
     ohm = size_of(faults, "resistance_asymmetry") * charging + size_of(faults, "resistance_growth")
     if (step := faults.get("resistance_step")) is not None:
         ohm = ohm + step.size * (drive.time_s >= step.full_shape["at_s"])
-    if (contact := faults.get("contact_flicker")) is not None:
-        ohm = ohm + contact.size * contact.is_active(drive.time_s)
     drop = ohm * I
     slower = np.exp(1500.0 * _over(T, 0.0))  # activation energy over the gas constant [K]
     for name, modes in (("fast_polarization", cole_cole), ("slow_diffusion", finite_warburg)):
@@ -361,11 +347,11 @@ def _hysteresis(drive: Drive, faults: Faults, drawn: FloatArray) -> FloatArray |
     if (fault := faults.get("hysteresis")) is None:
         return 0.0
     reach = fault.full_shape["reach"] * np.array([0.06, 0.15, 0.35, 0.65, 1.0])
-    followed = [stopped(drawn, each, drive.history * each) / each for each in reach.tolist()]
+    followed = [_stopped(drawn, each, drive.history * each) / each for each in reach.tolist()]
     return np.asarray(fault.size * np.mean(followed, axis=0))
 
 
-def stopped(signal: FloatArray, reach: float, start: float = 0.0) -> FloatArray:
+def _stopped(signal: FloatArray, reach: float, start: float) -> FloatArray:
     """Return the stop operator of a signal: from its start it follows, within ± its reach."""
     states = [start]
     for moved in np.diff(signal).tolist():

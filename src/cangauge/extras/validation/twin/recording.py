@@ -5,10 +5,14 @@ A recorded log is a drive too, whose temperatures are known: see `injection`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Final
 
 import numpy as np
+from scipy.optimize import brentq
 
 from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.drive import Drive
@@ -17,7 +21,6 @@ from cangauge.extras.validation.twin.faults import (
     Fault,
     Faults,
     faults_by_id,
-    find_size,
     size_of,
 )
 from cangauge.extras.validation.twin.pack import Sensors, TwinPack
@@ -27,9 +30,11 @@ from cangauge.extras.validation.twin.physics import (
     lagged,
     respond,
     simulate_truth,
-    stopped,
 )
 from cangauge.logs.log import Log
+
+_TOLERANCE: Final = 0.03
+"""Relative error of the gap at which the search for a size stops [-]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +84,8 @@ class Readings:
         return self.voltage_v - self.expected_v
 
 
-def read_drive(
-    pack: TwinPack, drive: Drive, faults: Faults = HEALTHY, healthy: Response | None = None
-) -> Readings:
-    """Simulate a drive with faults and read its sensors; `healthy` is the drive without."""
-    clean = simulate_truth(pack, drive) if healthy is None else healthy
+def read_drive(pack: TwinPack, drive: Drive, faults: Faults, clean: Response) -> Readings:
+    """Simulate a drive with faults and read its sensors; `clean` is the drive without."""
     truth = simulate_truth(pack, drive, faults, clean) if faults else clean
     current_a = measured_current(faults, drive.time_s, drive.current_a)
     temperature_c = measured_temperature(pack, faults, drive, truth.surface_c)
@@ -96,7 +98,7 @@ def read_drive(
     return Readings(
         truth=truth,
         current_a=current_a,
-        voltage_v=measured_voltage(pack, faults, drive.time_s, truth.voltage_v),
+        voltage_v=measured_voltage(faults, truth.voltage_v),
         temperature_c=temperature_c,
         shift_k=shift_k,
         expected_v=expected.voltage_v,
@@ -104,21 +106,49 @@ def read_drive(
 
 
 def scale_to_gap(
-    pack: TwinPack, drive: Drive, fault: Fault, target_v: float, healthy: Response
+    pack: TwinPack, drive: Drive, fault: Fault, target_v: float
 ) -> tuple[Fault, float]:
-    """Scale a fault to an RMS gap [V] over a drive, within its physical limits.
+    """Return a fault of the size that opens the wanted RMS gap over a drive, and that gap.
 
-    The size of `fault` gives the sign; `healthy` is the drive without it.
+    Where the physical limits of the size do not allow the wanted gap, it is the nearest.
+
+    Parameters
+    ----------
+    pack : TwinPack
+    drive : Drive
+    fault : Fault
+        Its size gives the sign.
+    target_v : float
+        RMS gap [V].
     """
+    healthy = simulate_truth(pack, drive)
     # A size that empties the pack sooner than in a quarter of an hour, or the half, is impossible.
     least_s = min(900.0, 0.5 * float(drive.time_s[-1]))
+    low, high = map(math.log, fault.kind.limits(pack))
+    tried: list[tuple[float, float, float]] = []
 
-    def gap_of(sized: Fault) -> float:
+    @cache  # brentq begins at both ends again
+    def excess(log_size: float) -> float:
+        """Return the logarithm of gap over target, 0 within the tolerance."""
+        sized = replace(fault, size=math.copysign(math.exp(log_size), fault.size))
         read = read_drive(pack, drive, faults_by_id([sized]), healthy)
         rows = read.truth.rows
-        return rms(read.gap_v[:rows]) if rows * drive.step_s >= least_s else float("inf")
+        if rows * drive.step_s < least_s:
+            return high - low
+        gap_v = rms(read.gap_v[:rows])
+        level = math.log(max(gap_v, 1e-9) / target_v)
+        tried.append((abs(level), sized.size, gap_v))
+        return 0.0 if abs(level) < _TOLERANCE else level
 
-    return find_size(gap_of, fault, target_v, pack)
+    if excess(high) > 0.0 > excess(low):
+        brentq(excess, low, high, xtol=0.1 * _TOLERANCE)
+    _, size, gap_v = min(tried, default=(0.0, 0.0, 0.0))
+    return replace(fault, size=size), gap_v
+
+
+def is_reached(gap_v: float, target_v: float) -> bool:
+    """Return whether a gap is the wanted one; otherwise the limits of the size prevent it."""
+    return abs(math.log(max(gap_v, 1e-9) / target_v)) < 2.0 * _TOLERANCE
 
 
 def record_drive(
@@ -127,7 +157,6 @@ def record_drive(
     faults: Sequence[Fault] = (),
     *,
     name: str = "log",
-    healthy: Response | None = None,
 ) -> Recording:
     """Simulate and record a drive with faults; the noise follows `drive.seed`.
 
@@ -138,11 +167,9 @@ def record_drive(
     faults : sequence of Fault
     name : str
         Name of the log.
-    healthy : Response, optional
-        The same drive without faults, if it is known already.
     """
     sensors, rng = pack.sensors, np.random.default_rng(drive.seed)
-    read = read_drive(pack, drive, faults_by_id(faults), healthy)
+    read = read_drive(pack, drive, faults_by_id(faults), simulate_truth(pack, drive))
     time_s = _sampling_times(sensors, float(drive.time_s[read.truth.rows - 1]), rng)
 
     def at(signal: FloatArray) -> FloatArray:
@@ -204,34 +231,12 @@ def rms(values: FloatArray) -> float:
 def measured_current(faults: Faults, time_s: FloatArray, current_a: FloatArray) -> FloatArray:
     """Return the current that a sensor reports [A], shape (n,)."""
     measured = np.interp(time_s - size_of(faults, "time_skew"), time_s, current_a)
-    if remanence_a := size_of(faults, "current_remanence"):
-        reach = 0.25 * float(np.max(np.abs(measured)))
-        measured = measured + remanence_a * stopped(measured, reach) / reach
-    measured = (1.0 + size_of(faults, "current_gain")) * measured + size_of(
-        faults, "current_offset"
-    )
-    limit = (1.0 - size_of(faults, "current_clipping")) * float(np.max(np.abs(measured)))
-    return np.clip(measured, -limit, limit)
+    return (1.0 + size_of(faults, "current_gain")) * measured + size_of(faults, "current_offset")
 
 
-def measured_voltage(
-    pack: TwinPack, faults: Faults, time_s: FloatArray, voltage_v: FloatArray
-) -> FloatArray:
+def measured_voltage(faults: Faults, voltage_v: FloatArray) -> FloatArray:
     """Return the voltage that a sensor reports [V], shape (n,)."""
-    measured = (1.0 + size_of(faults, "voltage_gain")) * voltage_v + size_of(
-        faults, "voltage_offset"
-    )
-    if (wave := faults.get("voltage_nonlinearity")) is not None:
-        period_v = wave.full_shape["period_share"] * pack.nominal_v
-        phase = 2.0 * np.pi * measured / period_v + wave.full_shape["phase"]
-        measured = measured + wave.size * np.sin(phase)
-    if (bursts := faults.get("noise_bursts")) is not None:
-        noise = np.random.default_rng(bursts.seed + 1).normal(size=measured.size)
-        measured = measured + bursts.size * noise * bursts.is_active(time_s)
-    if (stale := faults.get("stale_frames")) is not None:
-        rows = np.where(stale.is_active(time_s), 0, np.arange(measured.size))
-        measured = measured[np.maximum.accumulate(rows)]
-    return measured
+    return (1.0 + size_of(faults, "voltage_gain")) * voltage_v + size_of(faults, "voltage_offset")
 
 
 def measured_temperature(
@@ -242,5 +247,4 @@ def measured_temperature(
     # Two equal lags in series: a sensor in a pocket.
     for _ in range(2):
         measured = lagged(measured, drive.step_s, 0.5 * size_of(faults, "temperature_lag"))
-    held = size_of(faults, "temperature_stuck") * (measured[0] - measured)
-    return np.asarray(measured + held + size_of(faults, "temperature_offset"))
+    return measured + size_of(faults, "temperature_offset")

@@ -11,10 +11,15 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import require_number
 from cangauge.extras.validation.twin.drive import draw_drive
-from cangauge.extras.validation.twin.faults import Fault, is_reached, parse_effect
+from cangauge.extras.validation.twin.faults import Fault, parse_effect
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.physics import simulate_truth
-from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, scale_to_gap
+from cangauge.extras.validation.twin.recording import (
+    Recording,
+    is_reached,
+    record_drive,
+    rms,
+    scale_to_gap,
+)
 from cangauge.logs.log import Log
 
 
@@ -142,20 +147,19 @@ def simulate(
         speed_ms=speed_ms,
         discharge=discharge,
     )
-    healthy = simulate_truth(drawn, load)
     faults: list[Fault] = []
     notes: list[str] = []
     for number, text in enumerate([effects] if isinstance(effects, str) else effects):
         fault, gap_v = parse_effect(text, drawn, seed=seed + 7919 * number)
         if gap_v is not None:
-            fault, reached_v = scale_to_gap(drawn, load, fault, gap_v, healthy)
+            fault, reached_v = scale_to_gap(drawn, load, fault, gap_v)
             if not is_reached(reached_v, gap_v):
                 notes.append(
                     f"{fault.id}: on this drive its physical limits allow a gap of"
                     f" {reached_v:.3g} V, not {gap_v:.3g} V"
                 )
         faults.append(fault)
-    recording = record_drive(drawn, load, faults, name=name, healthy=healthy)
+    recording = record_drive(drawn, load, faults, name=name)
     soc_pct = np.append(recording.assumed_start_pct, recording.true_soc_pct[1:])
     log = replace(recording.log, soc_pct=soc_pct)
     return Simulation(log, recording, drawn, tuple(faults), tuple(notes))
