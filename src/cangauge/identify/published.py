@@ -19,7 +19,7 @@ from cangauge.errors import InputError
 from cangauge.identify.held_out import comparable, stated_error
 from cangauge.identify.least_squares import LOGS_AT_LEAST, SECONDS_PER_DATUM
 from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
-from cangauge.model.curve import BASIS_NAMES, EDGE, KNOTS_PCT, PublishedCurve, ocv_basis
+from cangauge.model.curve import BASIS_NAMES, KNOTS_PCT, PublishedCurve, extended_basis, ocv_basis
 from cangauge.model.model_file import Model, Published
 from cangauge.model.noise import Noise
 from cangauge.model.prior import principal_functions
@@ -154,15 +154,10 @@ class PublishedFit:
 
     def jacobian(self) -> FloatArray:
         """Return d(curve at the knots, kt, R1 … Rn)/d(coefficients)."""
-        n, p, epsilon = len(BASIS_NAMES), self.coefficients.size, self.equation.epsilon
-        low, high = self.soc_range_pct
-        part = EDGE * (high - low)
-        ends = ocv_basis([low, low + part, high - part, high], epsilon)
-        inside = np.clip(KNOTS_PCT, low, high)
-        beyond = (KNOTS_PCT - inside)[:, None]
-        slope = np.where(beyond < 0.0, ends[1] - ends[0], ends[3] - ends[2]) / part
+        n, p = len(BASIS_NAMES), self.coefficients.size
         jacobian = np.zeros((KNOTS_PCT.size + p - n, p))
-        jacobian[: KNOTS_PCT.size, :n] = ocv_basis(inside, epsilon) + beyond * slope
+        epsilon, soc_range_pct = self.equation.epsilon, self.soc_range_pct
+        jacobian[: KNOTS_PCT.size, :n] = extended_basis(KNOTS_PCT, epsilon, soc_range_pct)
         jacobian[KNOTS_PCT.size :, n:] = np.eye(p - n)
         return jacobian
 

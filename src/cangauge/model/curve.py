@@ -183,16 +183,27 @@ def _lowest_slopes(soc_pct: FloatArray, value: FloatArray, slope: FloatArray) ->
     return np.asarray(np.minimum(np.minimum(d0, d1), d0 + (b + a * t) * t))
 
 
-def _scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
-    """Return s, the SoC scaled into [ε, 1 − ε] so that ln s and ln(1 − s) are finite."""
-    return np.asarray(soc_pct, dtype=np.float64) / 100.0 * (1.0 - 2.0 * epsilon) + epsilon
-
-
 def ocv_basis(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
-    """Return the published pseudo-OCV's columns, shape (n, 8), for SoC [%] of shape (n,)."""
-    s = _scaled_soc(soc_pct, epsilon)
+    """Return the published pseudo-OCV's columns, shape (n, 8), for SoC [%] of shape (n,).
+
+    s is the SoC scaled into [ε, 1 − ε], so that ln s and ln(1 − s) are finite.
+    """
+    s = np.asarray(soc_pct, dtype=np.float64) / 100.0 * (1.0 - 2.0 * epsilon) + epsilon
     r = 1.0 / s
     return np.column_stack([np.ones_like(s), r, r**2, r**3, r**4, s, np.log(s), np.log1p(-s)])
+
+
+def extended_basis(
+    soc_pct: FloatArray, epsilon: float, soc_range_pct: tuple[float, float]
+) -> FloatArray:
+    """Return `ocv_basis`, continued in straight lines beyond the identified SoC, shape (n, 8)."""
+    low, high = soc_range_pct
+    part = EDGE * (high - low)
+    ends = ocv_basis([low, low + part, high - part, high], epsilon)
+    inside = np.clip(soc_pct, low, high)
+    beyond = (soc_pct - inside)[:, None]
+    slope = np.where(beyond < 0.0, ends[1] - ends[0], ends[3] - ends[2]) / part
+    return np.asarray(ocv_basis(inside, epsilon) + beyond * slope)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,15 +231,14 @@ class PublishedCurve:
 
     def __post_init__(self) -> None:
         low, high = self.soc_range_pct
-        if not high - low >= 0.01:  # below, slopes are quotients of rounding errors
-            raise InputError("the range is empty", field="soc_range_pct", value=(low, high))
-        ends = _scaled_soc([low, high], self.epsilon)
-        if not np.all((ends > 0.0) & (ends < 1.0)):
+        ends = [low * self._gain + self.epsilon, high * self._gain + self.epsilon]
+        # Below 0.01 %, slopes are quotients of rounding errors.
+        if not (high - low >= 0.01 and ends[0] > 0.0 and ends[1] < 1.0):
             raise InputError(
-                "the logarithms of the pseudo-OCV diverge within this range",
+                "the range is empty, or the logarithms of the pseudo-OCV diverge within it",
                 field="soc_range_pct",
                 value=(low, high),
-                cure="identify the model with a larger epsilon",
+                cure="identify the model on more SoC, or with a larger epsilon",
             )
         points = np.linspace(low, high, 401)
         slope = self.slopes(points)
@@ -241,47 +251,48 @@ class PublishedCurve:
                 cure="fit with --equation knots, whose curve rises",
             )
 
+    @property
+    def _gain(self) -> float:
+        """ds/dS [1/%]."""
+        return (1.0 - 2.0 * self.epsilon) / 100.0
+
     @cached_property
     def beyond(self) -> tuple[float, float]:
         """Slopes of the straight lines below and above the identified SoC [V per %]."""
         low, high = self.soc_range_pct
-        part = EDGE * (high - low)
-        volts = ocv_basis([low, low + part, high - part, high], self.epsilon) @ self.ocv_v
-        return float(volts[1] - volts[0]) / part, float(volts[3] - volts[2]) / part
+        volts = self.values(np.array([low - 1.0, low, high, high + 1.0]))
+        return float(volts[1] - volts[0]), float(volts[3] - volts[2])
+
+    def _slope(self, s: Any) -> Any:
+        """Return the slope at scaled SoC [V per %]: a number, or an array of shape (n,)."""
+        _, k1, k2, k3, k4, k5, k6, k7 = self.ocv_v
+        r = 1.0 / s
+        by_s = k5 + k6 * r - k7 / (1.0 - s)
+        by_s = by_s - r * r * (k1 + r * (2.0 * k2 + r * (3.0 * k3 + r * 4.0 * k4)))
+        return by_s * self._gain
 
     def at(self, soc_pct: float) -> tuple[float, float]:
         """Return voltage [V] and slope [V per %] at one SoC [%]."""
         lo, hi = self.soc_range_pct
         at = min(max(soc_pct, lo), hi)
         k0, k1, k2, k3, k4, k5, k6, k7 = self.ocv_v
-        gain = (1.0 - 2.0 * self.epsilon) / 100.0
-        s = at * gain + self.epsilon
+        s = at * self._gain + self.epsilon
         r = 1.0 / s
         volts = k0 + r * (k1 + r * (k2 + r * (k3 + r * k4))) + k5 * s
         volts += k6 * math.log(s) + k7 * math.log1p(-s)
         if soc_pct == at:
-            by_s = k5 + k6 * r - k7 / (1.0 - s)
-            by_s -= r * r * (k1 + r * (2.0 * k2 + r * (3.0 * k3 + r * 4.0 * k4)))
-            return volts, by_s * gain
+            return volts, self._slope(s)
         slope = self.beyond[0] if soc_pct < at else self.beyond[1]
         return volts + slope * (soc_pct - at), slope
 
     def values(self, soc_pct: FloatArray) -> FloatArray:
         """Return voltages [V] at SoC [%] of shape (n,)."""
-        inside = np.clip(soc_pct, *self.soc_range_pct)
-        low, high = self.beyond
-        straight = np.where(soc_pct < inside, low, high) * (soc_pct - inside)
-        return np.asarray(ocv_basis(inside, self.epsilon) @ self.ocv_v + straight)
+        return np.asarray(extended_basis(soc_pct, self.epsilon, self.soc_range_pct) @ self.ocv_v)
 
     def slopes(self, soc_pct: FloatArray) -> FloatArray:
         """Return slopes [V per %] at SoC [%] of shape (n,)."""
         lo, hi = self.soc_range_pct
-        s = _scaled_soc(np.clip(soc_pct, lo, hi), self.epsilon)
-        r = 1.0 / s
-        powers = [-order * r ** (order + 1) for order in (1, 2, 3, 4)]
-        zero, one = np.zeros_like(s), np.ones_like(s)
-        by_s = np.column_stack([zero, *powers, one, r, -1.0 / (1.0 - s)])
-        inside = by_s * ((1.0 - 2.0 * self.epsilon) / 100.0) @ self.ocv_v
+        inside = self._slope(np.clip(soc_pct, lo, hi) * self._gain + self.epsilon)
         low, high = self.beyond
         return np.asarray(np.where(soc_pct < lo, low, np.where(soc_pct > hi, high, inside)))
 
