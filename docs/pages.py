@@ -163,10 +163,8 @@ def effects_page() -> str:
         parts += [
             f"### {effect.id}",
             inspect.cleandoc(type(effect).__doc__ or ""),
-            f"**Signature.** {effect.signature}",
             f"```text\n{effect.equation}\n```",
-            f"**Separated by** {effect.separated_by}",
-            f"**Source.** {effect.source}",
+            inspect.cleandoc(effect.about),
             signature_svg(effect.id),
         ]
     return "\n\n".join(parts) + "\n"

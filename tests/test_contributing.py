@@ -22,10 +22,8 @@ HEATER_DROP = Effect(
     id="heater_drop",
     fault="voltage_reading",
     parameters=(Parameter("drop_v", "V", -0.04, 0.04),),
-    signature="a constant",
     equation="U = OCV − drop",
-    source="an example",
-    separated_by="nothing",
+    about="A constant, as an example.",
     drive=lambda load, values, *_: np.full_like(load.current_a, -values["drop_v"]),
 )
 """A constant drop at every current, as a worked example."""

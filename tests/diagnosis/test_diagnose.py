@@ -241,10 +241,8 @@ def test_an_effect_of_your_own_reaches_the_diagnosis(
         id="square_drop",
         fault="resistance",
         parameters=(Parameter("ohm_per_a", "ohm/A", -0.01, 0.01),),
-        signature="the square of the current",
         equation="ΔU = −k·I·|I|",
-        source="an example",
-        separated_by="nothing",
+        about="The square of the current, as an example.",
         drive=lambda load, v, *_: -v["ohm_per_a"] * load.current_a * np.abs(load.current_a),
     )
     monkeypatch.setitem(LIBRARY, "square_drop", square)  # type: ignore[misc] # a dict

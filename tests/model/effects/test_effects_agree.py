@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 
 import numpy as np
@@ -44,8 +45,10 @@ CELL = voltage_model(
 
 @each_effect
 def test_describes_itself(effect: Effect) -> None:
-    for text in (effect.signature, effect.equation, effect.source, effect.separated_by):
-        assert len(text.strip()) > 8 or text == "definition"
+    parts = re.split(r"\*\*(?:Signature\.|Separated by|Source\.)\*\*", effect.about)
+    assert len(parts) == 4
+    for text in map(str.strip, (*parts[1:], effect.equation)):
+        assert len(text) > 8 or text == "definition"
     assert effect.parameters
     assert len({parameter.name for parameter in effect.parameters}) == len(effect.parameters)
     for parameter in effect.parameters:
@@ -54,10 +57,7 @@ def test_describes_itself(effect: Effect) -> None:
         assert not is_amplitude or parameter.low <= parameter.neutral <= parameter.high
         for value in parameter.grid:
             assert parameter.low <= value <= parameter.high
-    constants = effect.constants(PACK)
-    named = {parameter.name for parameter in (*effect.amplitudes, *effect.shapes)}
-    assert named.isdisjoint(constants)
-    assert {parameter.name for parameter in effect.parameters} == named | set(constants)
+    assert {*effect.parameters} == {*effect.amplitudes, *effect.shapes}
 
 
 @each_effect
@@ -144,7 +144,8 @@ def test_amplitudes_enter_the_voltage_nearly_linearly(effect: Effect) -> None:
 def test_bounds_scale_with_the_pack(effect: Effect) -> None:
     """96 cells with 20 times the capacity: volts, amperes and ohms grow, ratios and times stay."""
     cell = Pack.of(CELL, 2.5)
-    pack = Pack(96.0 * cell.voltage_v, 50.0, 96.0 / 20.0 * cell.resistance_ohm)
+    ohm = 96.0 / 20.0 * cell.resistance_ohm
+    pack = Pack(96.0 * cell.voltage_v, 50.0, ohm, cell.temperature_c)
     ratio = {"V": 96.0, "V/K": 96.0, "A": 20.0, "ohm": 4.8}
     for parameter in effect.parameters:
         expected = np.array(parameter.bounds(cell)) * ratio.get(parameter.unit, 1.0)

@@ -11,10 +11,9 @@ An effect acts in up to three places, in this order:
 Everything is written once, over arrays. A log is one call; the estimator calls with arrays of one
 row and keeps the effect's `memory` in between. At its neutral values an effect changes nothing.
 
-Parameters are of three kinds. *Amplitudes* have a neutral value and enter the voltage (nearly)
+Parameters are of two kinds. *Amplitudes* have a neutral value and enter the voltage (nearly)
 linearly. *Shapes* (a time constant, a change point) have a grid of trial values and no meaning
-without an amplitude; `time_skew` has a single parameter that is both. *Constants* are taken from
-the pack when the effect is added (`Parameter.from_pack`).
+without an amplitude; `time_skew` has a single parameter that is both.
 
 An effect is a signature at the terminals; it does not prove a mechanism. It sees the model only
 through its pseudo-OCV, the slope of that, and its drop over the resistances.
@@ -103,15 +102,14 @@ class Parameter:
     name : str
     unit : str
         Bounds, neutral value, grid and `healthy_std` of a voltage, current or resistance are
-        relative to the pack's voltage, capacity or resistance.
+        relative to the pack's voltage, capacity or resistance, and the grid of a temperature to
+        the middle of its temperature range.
     low, high : float
         Physical bounds.
     neutral : float
         Value of an amplitude at which the effect does nothing.
     grid : tuple of floats, optional
         Trial values of a shape, of which the middle one is neutral; () for an amplitude.
-    from_pack : {"temperature_c"}, optional
-        Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
     healthy_std : float
         Standard deviation of an amplitude between logs of one healthy pack.
     """
@@ -122,7 +120,6 @@ class Parameter:
     high: float
     neutral: float = 0.0
     grid: tuple[float, ...] = ()
-    from_pack: Literal["temperature_c"] | None = None
     healthy_std: float = 0.0
 
     @property
@@ -133,7 +130,13 @@ class Parameter:
     def factor(self, pack: Pack) -> float:
         """Return what bounds and grid are relative to, in the parameter's unit."""
         volts = pack.voltage_v
-        sizes = {"A": pack.capacity_ah, "V": volts, "V/K": volts, "ohm": pack.resistance_ohm}
+        sizes = {
+            "A": pack.capacity_ah,
+            "V": volts,
+            "V/K": volts,
+            "ohm": pack.resistance_ohm,
+            "°C": pack.temperature_c,
+        }
         return sizes.get(self.unit, 1.0)
 
     def bounds(self, pack: Pack, margin: float = 1.0) -> tuple[float, float]:
@@ -141,11 +144,11 @@ class Parameter:
 
         Those relative to the pack are widened by the factor `margin` (`BOUND_MARGIN`).
         """
+        if not self.is_relative:
+            return self.low, self.high
         factor = self.factor(pack)
         low, high = self.low * factor, self.high * factor
-        if self.is_relative:
-            low, high = (low * margin if low < 0.0 else low / margin), high * margin
-        return low, high
+        return (low * margin if low < 0.0 else low / margin), high * margin
 
     def trials(self, pack: Pack) -> tuple[float, ...]:
         """Return the trial values of a shape in its unit; none for an amplitude."""
@@ -270,11 +273,10 @@ class Effect:
     fault : FaultName
         The fault that it is a shape of.
     parameters : tuple of Parameter
-    equation, source : str
-    signature : str
-        Its signature in U_measured − U_model, in words.
-    separated_by : str
-        The test that separates it from effects that look alike.
+    equation : str
+    about : str
+        Its signature in U_measured − U_model, the test that separates it from effects that look
+        alike, and its source: paragraphs for the page of effects.
     correct : callable
         (signals, values, context) → signals as ideal sensors would have shown them. Rows may be
         held back in the memory until later ones have come.
@@ -301,9 +303,7 @@ class Effect:
     fault: FaultName
     parameters: tuple[Parameter, ...]
     equation: str
-    source: str
-    signature: str
-    separated_by: str
+    about: str
     correct: Callable[[Signals, Values, Context], Signals] = same_signals
     count: Callable[[Counting, Values], Counting] = same_count
     drive: Callable[[Inputs, Values, Context], FloatArray | None] = none
@@ -317,7 +317,7 @@ class Effect:
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
         """Parameters that enter the voltage nearly linearly."""
-        return tuple(item for item in self.parameters if not (item.grid or item.from_pack))
+        return tuple(item for item in self.parameters if not item.grid)
 
     @property
     def shapes(self) -> tuple[Parameter, ...]:
@@ -368,21 +368,13 @@ class Effect:
             return np.zeros_like(soc_pct)
         return np.asarray(drive[rows] * self.over_soc(soc_pct, values, model.model))
 
-    def constants(self, pack: Pack) -> dict[str, float]:
-        """Return the parameters that are taken from the pack when the effect is added to it."""
-        return {
-            item.name: float(getattr(pack, item.from_pack))
-            for item in self.parameters
-            if item.from_pack is not None
-        }
-
     def neutral(self, pack: Pack) -> dict[str, float]:
         """Return values at which the effect does nothing."""
         values = {item.name: item.neutral * item.factor(pack) for item in self.amplitudes}
         for item in self.shapes:
             trials = item.trials(pack)
             values[item.name] = trials[len(trials) // 2]
-        return values | self.constants(pack)
+        return values
 
     def clipped(self, values: Values, pack: Pack) -> dict[str, float]:
         """Return values with the amplitudes clipped to the bounds of a model file."""

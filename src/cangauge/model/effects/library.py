@@ -111,7 +111,7 @@ def effect_entries(effects: Sequence[tuple[Effect, Values]]) -> list[dict[str, o
 
 
 def shape_key(effect: Effect, values: Values) -> tuple[object, ...]:
-    """Return id, shapes and constants: equal for two effects that differ in amplitude only."""
+    """Return id and shapes: equal for two effects that differ in amplitude only."""
     amplitudes = {parameter.name for parameter in effect.amplitudes}
     return (effect.id, *(values[p.name] for p in effect.parameters if p.name not in amplitudes))
 
@@ -151,6 +151,5 @@ def candidates(effects: Sequence[Effect], pack: Pack) -> list[EffectCandidate]:
         grids = [parameter.trials(pack) for parameter in shapes]
         for choice in itertools.product(*grids):
             shape = dict(zip((item.name for item in shapes), choice, strict=True))
-            shape |= effect.constants(pack)
             result.append(EffectCandidate(effect, shape, names, centre, bounds, steps))
     return result

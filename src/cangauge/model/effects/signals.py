@@ -169,14 +169,16 @@ CORRECTIONS: Final = (
         id="current_offset",
         fault="current_reading",
         parameters=(Parameter("offset_a", "A", -0.15, 0.15, healthy_std=5e-4),),
-        signature="a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C",
+        about="""
+            **Signature.** a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C
+
+            **Separated by** a long rest with the bus awake: the count drifts while no current
+            flows. Not separable from a load that bypasses the sensor; from capacity by alternating
+            driving and resting
+
+            **Source.** zero error, JCGM 200:2012 (VIM)
+            """,
         equation="I = I_measured − b",
-        source="zero error, JCGM 200:2012 (VIM)",
-        separated_by=(
-            "a long rest with the bus awake: the count drifts while no current flows. Not separable"
-            " from a load that bypasses the sensor; from capacity by alternating driving and"
-            " resting"
-        ),
         correct=partial(true_signals, "current_a"),
         core_form=partial(sensor_form, "current_sensor"),
     ),
@@ -184,13 +186,16 @@ CORRECTIONS: Final = (
         id="current_gain",
         fault="current_reading",
         parameters=(Parameter("gain_pct", "%", -10.0, 10.0),),
-        signature="a scaled drop over the resistance, and a slope over SoC as the count is scaled",
+        about="""
+            **Signature.** a scaled drop over the resistance, and a slope over SoC as the count is
+            scaled
+
+            **Separated by** a drive at high current over little SoC (drop) against a long gentle
+            one (count); not separable from a joint change of capacity and resistance
+
+            **Source.** sensitivity error, JCGM 200:2012 (VIM)
+            """,
         equation="I = I_measured / (1 + g)",
-        source="sensitivity error, JCGM 200:2012 (VIM)",
-        separated_by=(
-            "a drive at high current over little SoC (drop) against a long gentle one (count);"
-            " not separable from a joint change of capacity and resistance"
-        ),
         correct=partial(true_signals, "current_a"),
         core_form=partial(sensor_form, "current_sensor"),
     ),
@@ -198,14 +203,16 @@ CORRECTIONS: Final = (
         id="voltage_offset",
         fault="voltage_reading",
         parameters=(Parameter("offset_v", "V", -0.04, 0.04, healthy_std=2e-4),),
-        signature="a constant, at any current, SoC and temperature",
+        about="""
+            **Signature.** a constant, at any current, SoC and temperature
+
+            **Separated by** a log over much SoC: the error of an initial SoC shrinks where the OCV
+            is flat, that of a gain follows the voltage, this one is constant; or the voltage with
+            open contactors
+
+            **Source.** zero error, JCGM 200:2012 (VIM)
+            """,
         equation="U = U_measured − b",
-        source="zero error, JCGM 200:2012 (VIM)",
-        separated_by=(
-            "a log over much SoC: the error of an initial SoC shrinks where the OCV is flat, that"
-            " of a gain follows the voltage, this one is constant; or the voltage with open"
-            " contactors"
-        ),
         correct=partial(true_signals, "voltage_v"),
         core_form=partial(sensor_form, "voltage_sensor"),
     ),
@@ -213,13 +220,16 @@ CORRECTIONS: Final = (
         id="voltage_gain",
         fault="voltage_reading",
         parameters=(Parameter("gain_pct", "%", -4.0, 4.0),),
-        signature="in proportion to the voltage: nearly constant, a little smaller near empty",
+        about="""
+            **Signature.** in proportion to the voltage: nearly constant, a little smaller near
+            empty
+
+            **Separated by** a log from full to empty: at one SoC it is not separable from
+            voltage_offset, since the voltage of a pack varies by only a fifth
+
+            **Source.** sensitivity error, JCGM 200:2012 (VIM)
+            """,
         equation="U = U_measured / (1 + g)",
-        source="sensitivity error, JCGM 200:2012 (VIM)",
-        separated_by=(
-            "a log from full to empty: at one SoC it is not separable from voltage_offset, since"
-            " the voltage of a pack varies by only a fifth"
-        ),
         correct=partial(true_signals, "voltage_v"),
         core_form=partial(sensor_form, "voltage_sensor"),
     ),
@@ -262,13 +272,15 @@ CORRECTIONS: Final = (
                 ),
             ),
         ),
-        signature="∝ R·dI/dt: spikes of either sign at every change of load",
+        about="""
+            **Signature.** ∝ R·dI/dt: spikes of either sign at every change of load
+
+            **Separated by** a log at 10 Hz or faster: a skew gives spikes of both signs and the
+            same area at both ends of a pulse, fast_polarization a tail after each
+
+            **Source.** definition
+            """,
         equation="I(t) = I_measured(t + skew)",
-        source="definition",
-        separated_by=(
-            "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
-            " ends of a pulse, fast_polarization a tail after each"
-        ),
         correct=skewed_current,
         memory=skew_memory,
         core_form=skew_form,
@@ -279,12 +291,15 @@ CORRECTIONS: Final = (
         id="temperature_offset",
         fault="temperature",
         parameters=(Parameter("offset_k", "K", -20.0, 20.0, healthy_std=0.375),),
-        signature="kt·x and the drop over the resistance as if warmer, throughout the log",
+        about="""
+            **Signature.** kt·x and the drop over the resistance as if warmer, throughout the log
+
+            **Separated by** a second thermometer; a resistance that has grown leaves the voltage at
+            rest as it is
+
+            **Source.** zero error, JCGM 200:2012 (VIM)
+            """,
         equation="T = T_measured − x",
-        source="zero error, JCGM 200:2012 (VIM)",
-        separated_by=(
-            "a second thermometer; a resistance that has grown leaves the voltage at rest as it is"
-        ),
         correct=partial(true_signals, "temperature_c"),
         core_form=partial(sensor_form, "temperature_sensor"),
     ),
@@ -293,12 +308,16 @@ CORRECTIONS: Final = (
         id="temperature_lag",
         fault="temperature",
         parameters=(Parameter("tau_s", "s", 0.0, 2000.0),),
-        signature="kt·τ·dT/dt: while the pack warms or cools, zero at constant temperature",
+        about="""
+            **Signature.** kt·τ·dT/dt: while the pack warms or cools, zero at constant temperature
+
+            **Separated by** warming or cooling from outside without current: core_temperature needs
+            current
+
+            **Source.** first-order response of a sensor; Michalski et al., Temperature Measurement,
+            2001
+            """,
         equation="T = T_measured + τ·dT_measured/dt, the derivative smoothed over 200 s",
-        source="first-order response of a sensor; Michalski et al., Temperature Measurement, 2001",
-        separated_by=(
-            "warming or cooling from outside without current: core_temperature needs current"
-        ),
         correct=ahead_of_lag,
         memory=lag_memory,
         core_form=lag_form,
@@ -321,18 +340,18 @@ CORRECTIONS: Final = (
                 grid=(200.0, 500.0, 1000.0, 2000.0, 3500.0),
             ),
         ),
-        signature=(
-            "kt times low-passed I²: it builds up over minutes of high current of either sign; and"
-            " the negative change of the measured temperature over the same time"
-        ),
+        about="""
+            **Signature.** kt times low-passed I²: it builds up over minutes of high current of
+            either sign; and the negative change of the measured temperature over the same time
+
+            **Separated by** high current of alternating sign at constant SoC: slow_diffusion,
+            linear in I, cancels; temperature_lag follows the sensor and not the current
+
+            **Source.** two-state thermal model, Forgez et al., J. Power Sources 195 (2010) 2961
+            """,
         equation=(
             "T = T_m + ΔT + late·(T_τ − T_m),  τ·dΔT/dt = rise·(I/C)² − ΔT (rise: at a lasting"
             " 1 C), τ·dT_τ/dt = T_m − T_τ"
-        ),
-        source="two-state thermal model, Forgez et al., J. Power Sources 195 (2010) 2961",
-        separated_by=(
-            "high current of alternating sign at constant SoC: slow_diffusion, linear in I,"
-            " cancels; temperature_lag follows the sensor and not the current"
         ),
         correct=core_temperature,
         memory=core_temperature_memory,
@@ -346,13 +365,17 @@ COUNTS: Final = (
         id="capacity",
         fault="capacity",
         parameters=(Parameter("change_pct", "%", -35.0, 35.0, healthy_std=0.125),),
-        signature="OCV′·(Ah since the start): a slope over charge, steep in the knee near empty",
+        about="""
+            **Signature.** OCV′·(Ah since the start): a slope over charge, steep in the knee near
+            empty
+
+            **Separated by** a discharge from full to the knee at steady temperature; from
+            current_offset by alternating driving and resting, from current_gain by the drop over
+            the resistance
+
+            **Source.** Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4
+            """,
         equation="S = S₀ − 100·∫I dt / (C·(1 + x))",
-        source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4",
-        separated_by=(
-            "a discharge from full to the knee at steady temperature; from current_offset by"
-            " alternating driving and resting, from current_gain by the drop over the resistance"
-        ),
         count=changed_capacity,
         core_form=counted_form,
     ),
@@ -362,13 +385,15 @@ COUNTS: Final = (
         id="initial_soc",
         fault="start",
         parameters=(Parameter("offset_pct", "%", -15.0, 15.0, healthy_std=0.175),),
-        signature="OCV′(S): larger where the OCV is steep, at any current and time",
+        about="""
+            **Signature.** OCV′(S): larger where the OCV is steep, at any current and time
+
+            **Separated by** a long rest before the start (the first voltage is then the OCV), or a
+            log that reaches the steep ends of the OCV, where it grows and voltage_offset does not
+
+            **Source.** definition
+            """,
         equation="S₀ = S₀_assumed + x",
-        source="definition",
-        separated_by=(
-            "a long rest before the start (the first voltage is then the OCV), or a log that"
-            " reaches the steep ends of the OCV, where it grows and voltage_offset does not"
-        ),
         count=changed_start,
         core_form=counted_form,
     ),
@@ -378,13 +403,17 @@ COUNTS: Final = (
         id="coulombic_efficiency",
         fault="capacity",
         parameters=(Parameter("efficiency", "1", 0.85, 1.0, neutral=1.0),),
-        signature="OCV′·(Ah charged since the start): a drift that grows with regeneration only",
+        about="""
+            **Signature.** OCV′·(Ah charged since the start): a drift that grows with regeneration
+            only
+
+            **Separated by** logs with much and with little regeneration over the same discharge, or
+            a full charge within the log; not separable from capacity and current_offset in a plain
+            drive
+
+            **Source.** Plett, Battery Management Systems vol. II, Artech House 2015, ch. 1
+            """,
         equation="S = S₀ − 100·∫(I⁺ + η·I⁻)dt / C",
-        source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 1",
-        separated_by=(
-            "logs with much and with little regeneration over the same discharge, or a full charge"
-            " within the log; not separable from capacity and current_offset in a plain drive"
-        ),
         count=changed_efficiency,
         core_form=counted_form,
     ),

@@ -208,10 +208,15 @@ VOLTAGES: Final = (
         id="resistance_growth",
         fault="resistance",
         parameters=(Parameter("share", "1", -0.8, 3.0, healthy_std=0.0125), DELAYED),
-        signature="the drop over the resistance, larger from the first row on",
+        about="""
+            **Signature.** the drop over the resistance, larger from the first row on
+
+            **Separated by** the same pulse, warm and cold: a thermometer that reads too high grows
+            both
+
+            **Source.** definition
+            """,
         equation="ΔU = a·ΣRj·I(t − dj); or a·ΣRj·I in its place",
-        source="definition",
-        separated_by="the same pulse, warm and cold: a thermometer that reads too high grows both",
         scales_drop=True,
         drive=grown_drop,
         core_form=partial(core_values, "resistance_growth", ("share", "delayed", "resistance_ohm")),
@@ -225,17 +230,19 @@ VOLTAGES: Final = (
             Parameter("share", "1", 0.0, 3.0),
             Parameter("activation_k", "K", 100.0, 8000.0, grid=(1000.0, 2500.0, 4500.0)),
             DELAYED,
-            Parameter("reference_c", "°C", *PLAUSIBLE_C, from_pack="temperature_c"),
+            Parameter("reference_c", "°C", *PLAUSIBLE_C, grid=(1.0,)),
         ),
-        signature="the drop over the resistance, growing with (T₀ − T)",
+        about="""
+            **Signature.** the drop over the resistance, growing with (T₀ − T)
+
+            **Separated by** the same SoC at two temperatures (a second day): where temperature and
+            SoC move together it is not separable from resistance_soc
+
+            **Source.** Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885
+            """,
         equation=(
             "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ = reference_c;"
             " or ΣRj·I in place of ΣRj·I(t − dj)"
-        ),
-        source="Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885",
-        separated_by=(
-            "the same SoC at two temperatures (a second day): where temperature and SoC move"
-            " together it is not separable from resistance_soc"
         ),
         scales_drop=True,
         drive=colder_drop,
@@ -251,13 +258,15 @@ VOLTAGES: Final = (
             Parameter("width_pct", "%", 3.0, 60.0, grid=(5.0, 10.0, 20.0, 40.0)),
             DELAYED,
         ),
-        signature="I·f(S): the drop over the resistance, larger near empty",
+        about="""
+            **Signature.** I·f(S): the drop over the resistance, larger near empty
+
+            **Separated by** the same SoC at two temperatures: in one discharge SoC and temperature
+            move together and it is not separable from resistance_temperature
+
+            **Source.** Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885
+            """,
         equation="ΔU = ΣRj·I(t − dj)·(a·exp(−S/w) + b·exp(−(100 − S)/w)); or ΣRj·I in its place",
-        source="Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885",
-        separated_by=(
-            "the same SoC at two temperatures: in one discharge SoC and temperature move together"
-            " and it is not separable from resistance_temperature"
-        ),
         scales_drop=True,
         drive=drop,
         over_soc=ends_of_soc,
@@ -272,13 +281,15 @@ VOLTAGES: Final = (
         id="resistance_asymmetry",
         fault="resistance",
         parameters=(Parameter("charging_ohm", "ohm", -0.6, 1.5),),
-        signature="min(I, 0): only while charging, in step with the current",
+        about="""
+            **Signature.** min(I, 0): only while charging, in step with the current
+
+            **Separated by** charging and discharging pulses of several sizes: charge_transfer bends
+            with the size of the current, equally in both directions
+
+            **Source.** Hu, Li, Peng, J. Power Sources 198 (2012) 359
+            """,
         equation="ΔU = −r·min(I, 0)",
-        source="Hu, Li, Peng, J. Power Sources 198 (2012) 359",
-        separated_by=(
-            "charging and discharging pulses of several sizes: charge_transfer bends with the size"
-            " of the current, equally in both directions"
-        ),
         drive=drop_while_charging,
         core_form=partial(core_values, "resistance_asymmetry", ("charging_ohm",)),
     ),
@@ -292,13 +303,16 @@ VOLTAGES: Final = (
             Parameter("step_ohm", "ohm", -0.4, 2.0),
             Parameter("start_s", "s", 0.0, 1e7, grid=(1800.0,)),
         ),
-        signature="I·1(t > t₀): the drop over the resistance changes in a step and stays changed",
+        about="""
+            **Signature.** I·1(t > t₀): the drop over the resistance changes in a step and stays
+            changed
+
+            **Separated by** the same load before and after at the same SoC and temperature:
+            resistance_temperature and resistance_soc revert, a step does not
+
+            **Source.** definition
+            """,
         equation="ΔU = −r·I for t − t_first ≥ t₀, else 0",
-        source="definition",
-        separated_by=(
-            "the same load before and after at the same SoC and temperature:"
-            " resistance_temperature and resistance_soc revert, a step does not"
-        ),
         memory=first_time,
         drive=drop_after_step,
         core_form=partial(core_values, "resistance_step", ("step_ohm", "start_s")),
@@ -321,14 +335,17 @@ VOLTAGES: Final = (
             Parameter("bend_only", "1", 0.0, 1.0, grid=(1.0, 0.0)),
             Parameter("activation_k", "K", 0.0, 10000.0, grid=(ACTIVATION_K,)),
         ),
-        signature="I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones",
+        about="""
+            **Signature.** I − c·asinh(I/2I₀): too much drop at small currents, too little at large
+            ones
+
+            **Separated by** pulses of several sizes in both directions; resistance_asymmetry is
+            straight on each side of zero
+
+            **Source.** Newman, Thomas-Alyea, Electrochemical Systems, 3rd ed., Wiley 2004, ch. 8
+            """,
         equation=(
             "ΔU = −v·(asinh(I/2I₀) − b·(I/I₁)·asinh(I₁/2I₀)), I₁ = 1 C, I₀ after Arrhenius (B)"
-        ),
-        source="Newman, Thomas-Alyea, Electrochemical Systems, 3rd ed., Wiley 2004, ch. 8",
-        separated_by=(
-            "pulses of several sizes in both directions; resistance_asymmetry is straight on each"
-            " side of zero"
         ),
         drive=bend,
         core_form=bend_form,
@@ -342,12 +359,15 @@ VOLTAGES: Final = (
             Parameter("tau_s", "s", 0.3, 9.0, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
             ACTIVATION,
         ),
-        signature="a tail of seconds after every change of load",
+        about="""
+            **Signature.** a tail of seconds after every change of load
+
+            **Separated by** a log at 10 Hz or faster with sharp pulses: time_skew gives spikes
+            without tails
+
+            **Source.** Hu, Li, Peng, J. Power Sources 198 (2012) 359
+            """,
         equation="ΔU = −R·y·exp(B·(1/T − 1/T₂₅)), τ·dy/dt = I − y",
-        source="Hu, Li, Peng, J. Power Sources 198 (2012) 359",
-        separated_by=(
-            "a log at 10 Hz or faster with sharp pulses: time_skew gives spikes without tails"
-        ),
         memory=rc_memory,
         drive=rc_voltage,
         core_form=rc_form,
@@ -370,15 +390,17 @@ VOLTAGES: Final = (
             ACTIVATION,
             Parameter("by_slope", "1", 0.0, 1.0, grid=(0.0,)),
         ),
-        signature="low-passed current over 70–2500 s: it decays through a rest after a drive",
+        about="""
+            **Signature.** low-passed current over 70–2500 s: it decays through a rest after a drive
+
+            **Separated by** a rest of an hour after a drive: hysteresis persists, this decays;
+            core_temperature is even in the current
+
+            **Source.** Plett, Battery Management Systems vol. I, Artech House 2015, ch. 2
+            """,
         equation=(
             "ΔU = −R·f(S)·y·exp(B·(1/T − 1/T₂₅)), τ·dy/dt = I − y;"
             " f = 1 − b + b·U₀′(S)/mean U₀′, b = by_slope"
-        ),
-        source="Plett, Battery Management Systems vol. I, Artech House 2015, ch. 2",
-        separated_by=(
-            "a rest of an hour after a drive: hysteresis persists, this decays;"
-            " core_temperature is even in the current"
         ),
         over_soc=steepness,
         memory=rc_memory,
@@ -395,15 +417,16 @@ VOLTAGES: Final = (
             Parameter("half_width_v", "V", 0.0, 0.01),
             Parameter("travel_pct", "%", 0.5, 12.0, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
         ),
-        signature=(
-            "memory of sign(I) over Ah: reverses with lasting charge or discharge, persists at rest"
-        ),
+        about="""
+            **Signature.** memory of sign(I) over Ah: reverses with lasting charge or discharge,
+            persists at rest
+
+            **Separated by** rests of an hour after a discharge and after a charge to the same SoC:
+            slow_diffusion decays, this persists
+
+            **Source.** one-state model, Plett, J. Power Sources 134 (2004) 262
+            """,
         equation="ΔU = M·h, dh/dt = |I|/(γ·C)·(−sign(I) − h)",
-        source="one-state model, Plett, J. Power Sources 134 (2004) 262",
-        separated_by=(
-            "rests of an hour after a discharge and after a charge to the same SoC:"
-            " slow_diffusion decays, this persists"
-        ),
         memory=hysteresis_memory,
         drive=hysteresis_voltage,
         core_form=hysteresis_form,
@@ -417,13 +440,15 @@ VOLTAGES: Final = (
             Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4),
             Parameter("curve_v_per_k", "V/K", -1.1e-4, 1.1e-4),
         ),
-        signature="(T − T_r)·f(S), at any current",
+        about="""
+            **Signature.** (T − T_r)·f(S), at any current
+
+            **Separated by** the same SoC, rested, at two temperatures; at one temperature it is not
+            separable from any other change of the OCV with SoC
+
+            **Source.** Reynier, Yazami, Fultz, J. Power Sources 119–121 (2003) 850
+            """,
         equation="ΔU = (T − T_r)·(c + a·x + b·(3x² − 1)/2), x = S/50 − 1",
-        source="Reynier, Yazami, Fultz, J. Power Sources 119–121 (2003) 850",
-        separated_by=(
-            "the same SoC, rested, at two temperatures; at one temperature it is not separable from"
-            " any other change of the OCV with SoC"
-        ),
         drive=warmer_k,
         over_soc=entropic_v_per_k,
         core_form=partial(
@@ -447,13 +472,15 @@ VOLTAGES: Final = (
                 grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),
             ),
         ),
-        signature="the knee near empty comes early, by the fraction of weak cells",
+        about="""
+            **Signature.** the knee near empty comes early, by the fraction of weak cells
+
+            **Separated by** a discharge to below 10 %: a lost capacity of all cells brings the
+            whole knee forward, weak cells a small one; or the cells' own voltages
+
+            **Source.** Dubarry, Vuillaume, Liaw, Int. J. Energy Res. 34 (2010) 216
+            """,
         equation="ΔU = (n/N)·(OCV(S_w) − OCV(S)), 1 − S_w = (1 − S)/(1 − d)",
-        source="Dubarry, Vuillaume, Liaw, Int. J. Energy Res. 34 (2010) 216",
-        separated_by=(
-            "a discharge to below 10 %: a lost capacity of all cells brings the whole knee forward,"
-            " weak cells a small one; or the cells' own voltages"
-        ),
         drive=fraction,
         over_soc=weak_less_healthy,
         core_form=weak_form,
