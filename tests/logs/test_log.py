@@ -283,11 +283,11 @@ def test_tables_of_any_columns(tmp_path: Path) -> None:
         ("s,A,V,°C,%,cell", None),
         ("[s],(A),[V],degC,,", None),
         ("f8,f8,float64,double,f4,\ns,A,V,°C,%,cell", None),
-        ("s,mA,V,degC,%", "time_s: row 1 is not a time .got 's'"),
-        ("s,A,mV,°C,%", "time_s: row 1 is not a time .got 's'"),
-        ("s,A,V,K,%", "time_s: row 1 is not a time .got 's'"),
+        ("s,mA,V,degC,%", "the row of units contradicts the headings .got 's,"),
+        ("s,A,mV,°C,%", "the row of units contradicts the headings .got 's,"),
+        ("s,A,V,K,%", "the row of units contradicts the headings .got 's,"),
         ("abc,5,300,20,50", "time_s: row 1 is not a time .got 'abc'"),
-        (",mA,,,", "current_a: row 1 is not a number .got 'mA'"),
+        (",mA,,,", "the row of units contradicts the headings .got ',mA,"),
     ],
 )
 def test_names_of_a_canonical_log_define_its_units(

@@ -11,12 +11,12 @@ from typing import Final
 from cangauge.errors import InputError, closest
 from cangauge.logs.column_map import DOCS, SYNTAX, ColumnMap, meant_by
 from cangauge.logs.headings import Meaning, Rank, meaning_of, parse_heading
-from cangauge.logs.quantities import FIELDS, QUANTITIES, REQUIRED, unit_of
+from cangauge.logs.log import SOURCE
+from cangauge.logs.quantities import FIELDS, QUANTITIES, unit_of
 from cangauge.settings import TemperatureSource
 
 NEEDED: Final = ("time", "current", "voltage")
 """Quantities that every table holds; a temperature may be given as a constant."""
-_CANONICAL: Final = (*FIELDS.values(), "temperature_source")
 _JOINED: Final = ("time", "temperature")
 """Quantities of several columns: a date and its time; probes, whose median is taken."""
 
@@ -147,10 +147,11 @@ def choose_columns(
     InputError
         If a column of the user is not in the table, or is named for two quantities.
     """
-    if given is None and are_canonical(headings):
-        return _canonical(headings)
     units = [*units_below, *repeat("", len(headings))]
     meanings = [*map(meaning_of, headings, units)]
+    canonical = None if given else _canonical(headings, units, meanings)
+    if canonical is not None:
+        return canonical
     choice, stated = Choice(), given or ColumnMap()
     for quantity in stated.texts:
         column = _given_column(quantity, stated, headings, meanings)
@@ -175,42 +176,36 @@ def _rank(found: _Found) -> Rank:
     return found[1].rank
 
 
-def _canonical(headings: Sequence[str]) -> Choice:
+def _canonical(
+    headings: Sequence[str], units: Sequence[str], meanings: Sequence[Meaning | None]
+) -> Choice | None:
+    """Return the columns with the names of a canonical log; None if the table is another one.
+
+    A temperature of another name is not a missing one, and a row of units may contradict the
+    names: such a table is a logger's own.
+    """
     names = [_simple(heading) for heading in headings]
     chosen = {
         quantity: ChosenColumn((names.index(name),), QUANTITIES[quantity].unit)
         for quantity, name in FIELDS.items()
         if name in names
     }
-    return Choice(chosen, is_canonical=True)
-
-
-def are_canonical(headings: Sequence[str]) -> bool:
-    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
-
-    A temperature of another name is not a missing one: such a table is a logger's own.
-    """
-    names = {_simple(heading) for heading in headings}
-    if len(names.intersection(REQUIRED)) < 2:
-        return False
-    return "temperature_c" in names or not any(map(_is_temperature, names.difference(_CANONICAL)))
-
-
-def _is_temperature(name: str) -> bool:
-    meaning = meaning_of(name)
-    return "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
+    if not chosen.keys() >= set(NEEDED):
+        return None
+    if "temperature" not in chosen:
+        others = zip(names, meanings, strict=True)
+        if any(each and each.quantity == "temperature" and name != SOURCE for name, each in others):
+            return None
+    stated = ((FIELDS[name], units[each.places[0]].strip("()[]")) for name, each in chosen.items())
+    is_canonical = all(unit_of(*each) in {None, (1.0, 0.0)} for each in stated)
+    return Choice(chosen, is_canonical=True) if is_canonical else None
 
 
 def refuse_odd_names(headings: Sequence[str], source: str) -> None:
-    """Raise InputError if a column of the canonical log is missing, or if two have its name."""
+    """Raise InputError if two columns have a name of the canonical log."""
     names = [_simple(heading) for heading in headings]
-    for name in _CANONICAL:
+    for name in (*FIELDS.values(), SOURCE):
         refuse_doubled(name, names, source)
-        if name in REQUIRED[:3] and name not in names:
-            problem = f"this column is missing (found: {shown_headings(headings)})"
-            cure = "a log needs time_s, current_a (positive = discharge), voltage_v,"
-            cure += " temperature_c [s, A, V, °C]"
-            raise InputError(problem, source=source, field=name, cure=cure)
 
 
 def refuse_doubled(name: str, names: Sequence[str], source: str | None) -> None:

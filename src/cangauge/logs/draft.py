@@ -20,8 +20,9 @@ from cangauge.logs.sign import Sign, SignSource
 from cangauge.settings import TemperatureSource
 from cangauge.types import SOC_WITHIN_PCT
 
-COUNTER: Final = "#"
-"""Begins the name of a value that may count the charge [Ah]; its heading follows."""
+BESIDES: Final = "#"
+"""Begins the name of a value that is none of the log's, such as one that may count the charge [Ah];
+its heading follows."""
 MAX_INCOMPLETE: Final = 0.05
 """Largest fraction of incomplete rows that are dropped [-]: beyond it the export is damaged, or its
 rows hold only what changed."""
@@ -133,7 +134,7 @@ class DraftLog:
         self._remark_values()
         for values in self.values.values():
             values.flags.writeable = False  # the log need not copy them
-        columns = {name: each for name, each in self.values.items() if name[:1] != COUNTER}
+        columns = {name: each for name, each in self.values.items() if name[:1] != BESIDES}
         log = Log(
             **columns,
             name=self.name,

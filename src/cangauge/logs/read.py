@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -20,14 +19,14 @@ from cangauge.errors import InputError, require_temperature
 from cangauge.logs.canonical import parquet_table, table_of_schema
 from cangauge.logs.column_map import DOCS, ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
-from cangauge.logs.draft import DraftLog
+from cangauge.logs.draft import BESIDES, DraftLog
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.quantities import FIELDS
 from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
-from cangauge.logs.values import UnclearMarkError, is_number, numbers_of
+from cangauge.logs.values import is_number
 from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
@@ -40,8 +39,6 @@ _FORMATS: Final = tuple(
 )
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
 _PARQUET: Final = b"PAR1"
-_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
-"""Headings of CAN frames: an id, a length or bytes."""
 GROUP: Final = "cangauge.readers"
 """Entry points of readers of other packages: a `LogReader`."""
 
@@ -138,32 +135,8 @@ class LogFile:
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
     ) -> Log:
-        """Read the log; arguments and errors as of `cangauge.read_log`.
-
-        If a mark is unclear (`3,800`) and only one reading of it makes a log, it is taken.
-        """
+        """Read the log; arguments and errors as of `cangauge.read_log`."""
         require_temperature(temperature_c)
-        self.head.decimal_mark = ""
-        try:
-            return self._read(temperature_c, temperature_source)
-        except UnclearMarkError as error:
-            logs = dict[str, Log]()
-            for mark in (",", "."):
-                self.head.decimal_mark = mark
-                with suppress(InputError):
-                    logs[mark] = self._read(temperature_c, temperature_source)
-            if len(logs) != 1:
-                raise
-            ((mark, log),) = logs.items()
-            self.head.decimal_mark = mark
-            taken = "decimals" if mark in str(error.value) else "thousands"
-            remark = f"{error.field}: the mark in {error.value} separates {taken}"
-            remark += "; the other reading makes no log"
-            return replace(log, remarks=(*log.remarks, remark))
-
-    def _read(
-        self, temperature_c: float | None, temperature_source: TemperatureSource | None
-    ) -> Log:
         reader = self.reader
         if reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
@@ -203,21 +176,12 @@ class LogFile:
         cells = _cells(table.headings, source)
         if len(cells) < 2:  # a single cell is its pack
             return None
-        places = [place for place, _ in cells.values()]
-        chosen = choose_columns(table.headings, table.units, self.columns).chosen
-        others = [place for column in chosen.values() for place in column.places]
-        # The other columns may prove the decimal mark of the cells.
-        wanted = dict.fromkeys([*places, *others])
-        columns = table.columns([*wanted], times=chosen["time"].places)
-        each_v = [
-            scale * numbers_of(columns[place], source, table.headings[place])[0]
-            for place, scale in cells.values()
-        ]
-        volts = np.column_stack(each_v)
-        draft = draft_of_table(table, self.columns, name=self.head.name, source=source)
+        scales = dict(cells.values())
+        draft = draft_of_table(
+            table, self.columns, name=self.head.name, source=source, besides=scales
+        )
+        volts = np.column_stack([draft.values[f"{BESIDES}{table.headings[k]}"] for k in scales])
         file_s = draft.values["time_s"]
-        if file_s.size != volts.shape[0]:
-            return None  # rows that hold only what changed
         order = np.argsort(file_s, kind="stable")
         rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
         is_row = (file_s[rows] == time_s)[:, None]
@@ -235,11 +199,11 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     if foreign is not None:
         kind, cure = foreign
         problem = f"{problem}: it is {kind}"
-    elif len(headings) > 2 and len(_FRAME_WORDS.intersection(map(_simple, headings))) < 2:
+    elif sum(map(bool, headings)) > 1:
         unknown = UnknownColumnsError(str(head.path), headings, choice, None)
         error = unknown.proposing(partial(file.can_read, LogTableReader()))
         problem, cure = f"{problem}: {error.problem}", error.cure or ""
-    elif bare is not None and not headings:
+    elif bare is not None:
         problem, count = f"{problem}: a table without a header", len(bare.headings)
         named = ",".join(f"{name}=#{k}" for k, name in enumerate([*FIELDS][:count], start=1))
         cure = f"name its {count} columns by number, such as --columns '{named}' ({DOCS})"

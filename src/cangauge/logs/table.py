@@ -29,7 +29,7 @@ from cangauge.logs.columns import (
     refuse_doubled,
     refuse_odd_names,
 )
-from cangauge.logs.draft import COUNTER, MAX_INCOMPLETE, DraftLog
+from cangauge.logs.draft import BESIDES, MAX_INCOMPLETE, DraftLog
 from cangauge.logs.headings import Rank, charge_scale, parse_heading
 from cangauge.logs.log import SOURCE
 from cangauge.logs.quantities import (
@@ -42,7 +42,7 @@ from cangauge.logs.quantities import (
 )
 from cangauge.logs.stamps import changes_of_clock, is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
-from cangauge.logs.values import first_text, is_number, numbers_of, read_cells
+from cangauge.logs.values import first_text, is_number, is_text, numbers_of, read_cells
 
 MAX_COUNTERS: Final = 6
 """Most columns in Ah among which the one that counts the charge is searched [-]."""
@@ -79,7 +79,6 @@ class ArrowTable:
     source: str | None = None
     units: Sequence[str] = ()
     remarks: list[str] = field(default_factory=list)
-    decimal_mark: str = ""
 
     def columns(
         self,
@@ -93,14 +92,20 @@ class ArrowTable:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
-        source, mark = self.source, self.decimal_mark
-        return read_cells(columns, self.headings, source, mark, times=times, optional=optional)
+        return read_cells(columns, self.headings, self.source, times=times, optional=optional)
 
 
 def draft_of_table(
-    table: TextTable | ArrowTable, given: ColumnMap | None, *, name: str, source: str
+    table: TextTable | ArrowTable,
+    given: ColumnMap | None,
+    *,
+    name: str,
+    source: str,
+    besides: Mapping[int, float] | None = None,
 ) -> DraftLog:
     """Return the draft of a log from a table; `given` are the user's columns.
+
+    `besides` are further columns to take, by place, with factors; by default those in Ah.
 
     Raises
     ------
@@ -120,7 +125,8 @@ def draft_of_table(
     taken = [*measured, *times, *words]
     unit_columns = {k: k + 1 for k in taken if _UNITS.search("".join(headings[k + 1 : k + 2]))}
     counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, taken)
-    wanted = dict.fromkeys([*taken, *unit_columns.values(), *counters])
+    others = besides or counters
+    wanted = dict.fromkeys([*taken, *unit_columns.values(), *others])
     cells = table.columns([*wanted], times=times, optional=[*counters])
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     units = {place: _only_word(cells[k], where, headings[k]) for place, k in unit_columns.items()}
@@ -132,7 +138,7 @@ def draft_of_table(
             unit = _take(draft, quantity, column, cells, beside)
         if not choice.is_canonical:
             draft.assumed.append(_assumption(draft, quantity, column.factor, unit))
-    _take_counters(draft, cells, counters)
+    _take_besides(draft, cells, others, may_be_words=besides is None)
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
     word: str = chosen["temperature"].source if "temperature" in chosen else "unknown"
@@ -155,13 +161,15 @@ def _assumption(draft: DraftLog, quantity: str, factor: float, unit: str) -> str
     return f'{quantity} = "{shown}"{times} [{unit}]'
 
 
-def _take_counters(draft: DraftLog, cells: dict[int, Any], counters: Mapping[int, float]) -> None:
-    """Take columns that may count the charge [Ah], less those of words."""
-    for place, scale in counters.items():
-        label = draft.headings[place]
-        with suppress(InputError):
-            count, _ = numbers_of(cells[place], draft.where, label)
-            draft.values[f"{COUNTER}{label}"] = count * scale
+def _take_besides(
+    draft: DraftLog, cells: dict[int, Any], factors: Mapping[int, float], *, may_be_words: bool
+) -> None:
+    """Take columns that are none of the log's."""
+    for place, factor in factors.items():
+        if not (may_be_words and is_text(cells[place])):
+            label = draft.headings[place]
+            numbers, _ = numbers_of(cells[place], draft.where, label)
+            draft.values[f"{BESIDES}{label}"] = numbers * factor
 
 
 def _counters(table: TextTable | ArrowTable, taken: Sequence[int]) -> dict[int, float]:

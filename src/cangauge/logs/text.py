@@ -17,9 +17,8 @@ import pyarrow.csv as pacsv
 from cangauge._files import HEAD_BYTES, Head, as_utf8
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import NEEDED, Choice, are_canonical, choose_columns
+from cangauge.logs.columns import NEEDED, Choice, choose_columns
 from cangauge.logs.headings import meaning_of
-from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps, is_stamp
 from cangauge.logs.values import (
     has_spelled_numbers,
@@ -35,7 +34,6 @@ MAX_COLUMNS: Final = 10_000
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _ROWS_ABOVE_DATA: Final = 4
 """Rows of units, types and remarks between a header and its data."""
-_TYPES: Final = frozenset({"f4", "f8", "float", "float32", "float64", "double"})
 
 
 class TextTable(NamedTuple):
@@ -96,8 +94,8 @@ class TextTable(NamedTuple):
             self.remarks.append(f"the last line has no line end: {doubt}")
         headings = [*self.headings, *repeat("", width)]
         columns = {place: table.column(names[place]) for place in places}
-        source, mark = str(self.head.path), self.head.decimal_mark
-        return read_cells(columns, headings, source, mark, times=times, optional=optional)
+        source = str(self.head.path)
+        return read_cells(columns, headings, source, times=times, optional=optional)
 
     def _parsed(
         self, data: bytes, names: list[str], types: Mapping[str, Any]
@@ -175,19 +173,15 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         bare = without_header(head)
         if bare is not None:
             return bare
-    canonical = None
-    headers = ((table, rows) for rows in (1, 2) for table in headed(head, rows))
-    for table, rows in headers:
-        try:
-            choice = choose_columns(table.headings, (), given)
-        except InputError:  # no column has a heading that the user names
-            continue
-        if choice.is_complete:
-            units = _units_above(table, table.skip_lines - rows, choice)
-            return _above_data(table._replace(units=units), choice, given)
-        if choice.is_canonical and canonical is None:
-            canonical = _above_data(table, choice, given)
-    return canonical
+    for rows in (1, 2):
+        for table in headed(head, rows):
+            try:
+                choice = choose_columns(table.headings, (), given)
+            except InputError:  # no column has a heading that the user names
+                continue
+            if choice.is_complete:
+                return _above_data(table, rows, choice, given)
+    return None
 
 
 def headed(head: Head, rows: int) -> Iterator[TextTable]:
@@ -199,61 +193,36 @@ def headed(head: Head, rows: int) -> Iterator[TextTable]:
         if any(len(row) != len(first) or _values_in(row[1:]) for row in second):
             continue
         headings = [" ".join(cells).strip() for cells in zip(first, *second, strict=True)]
-        if len(headings) > 2 or are_canonical(headings):
-            yield TextTable(head, delimiter, headings, (), number + rows, [])
+        yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
-def _above_data(table: TextTable, choice: Choice, given: ColumnMap | None) -> TextTable:
-    """Return a table without the rows above its data; one of them may hold units.
+def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | None) -> TextTable:
+    """Return a table without the rows above its data, with their units.
 
-    A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
-    Below canonical names, it repeats their units; any other row is data.
+    Rows below the header that hold no value of time, current and voltage are above the data. One
+    of them, or the row above the header, holds units if it gives a quantity another unit, or shows
+    that it is none (`t`, °C).
     """
-    chosen = choice.chosen
-    measured = [chosen[name].places[-1] for name in NEEDED if name in chosen]
-    units, first = table.units, table.skip_lines
-    for number, line in enumerate(table.head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
+    measured = [choice.chosen[name].places[-1] for name in NEEDED]
+    lines, first = table.head.lines, table.skip_lines
+    above = [line for line in lines[: first - rows] if line.strip()][-1:]
+    below = lines[first : first + _ROWS_ABOVE_DATA]
+    for number, line in enumerate([*above, *below], start=first - len(above)):
         row = split_cells(line, table.delimiter)
-        cell = next((row[k] for k in measured if k < len(row) and row[k]), "")
-        if not _repeats_units(row, choice) if choice.is_canonical else _is_value(cell):
-            return table._replace(units=units, skip_lines=number)
-        again = choose_columns(table.headings, row, given).chosen
-        if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
-            units = row
-    return table._replace(units=units)
-
-
-def _units_above(table: TextTable, header: int, choice: Choice) -> list[str]:
-    """Return the row above the header if it holds a unit of every quantity; [] if not.
-
-    Raises
-    ------
-    InputError
-        If it contradicts the names of the canonical log.
-    """
-    above = next((line for line in table.head.lines[:header][::-1] if line.strip()), "")
-    row = split_cells(above, table.delimiter)
-    if len(row) != len(table.headings):
-        return []
-    scales = [
-        unit_of(FIELDS[name], row[place].strip("()[]"))
-        for name, column in choice.chosen.items()
-        for place in column.places
-    ]
-    if None in scales:
-        return []
-    if choice.is_canonical and {*scales} != {(1.0, 0.0)}:
-        problem, cure = "the row of units above contradicts the headings", "correct one of them"
-        raise InputError(problem, source=table.head.path, value=above.strip()[:80], cure=cure)
-    return row
-
-
-def _repeats_units(row: Sequence[str], choice: Choice) -> bool:
-    """Return whether a row holds the units of the canonical log, or types, and nothing else."""
-    fields = {column.places[0]: FIELDS[name] for name, column in choice.chosen.items()}
-    cells = [(fields[k], cell.strip("()[]")) for k, cell in enumerate(row) if k in fields and cell]
-    is_unit = (unit_of(name, cell) == (1.0, 0.0) or cell.lower() in _TYPES for name, cell in cells)
-    return bool(cells) and all(is_unit)
+        cells = [row[k] for k in measured if k < len(row) and row[k]]
+        is_data = bool(cells) and (_is_value(cells[0]) or _values_in(cells) > 0)
+        if is_data and number >= first:
+            return table._replace(skip_lines=number)
+        if is_data or (number < first and len(row) != len(table.headings)):
+            continue
+        again = choose_columns(table.headings, row, given)
+        if choice.is_canonical and not again.is_canonical:
+            problem, cure = "the row of units contradicts the headings", "correct one of them"
+            raise InputError(problem, source=table.head.path, value=line.strip()[:80], cure=cure)
+        units = {name: column.unit for name, column in again.chosen.items()}
+        if any(units.get(name) != column.unit for name, column in choice.chosen.items()):
+            table = table._replace(units=row)
+    return table
 
 
 def without_header(head: Head) -> TextTable | None:

@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from cangauge._files import Head
-from cangauge._typing import FloatArray
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import shown_headings
-from cangauge.logs.draft import DraftLog
+from cangauge.logs.draft import BESIDES, DraftLog
 from cangauge.logs.headings import parse_heading
-from cangauge.logs.quantities import REQUIRED, convert
+from cangauge.logs.quantities import FIELDS
+from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, split_cells
-from cangauge.logs.values import numbers_of
 from cangauge.settings import TemperatureSource
 
 
@@ -106,35 +105,45 @@ class Export:
             If a column is missing, or holds anything but numbers.
         """
         header, skip_lines = self._header(head) or ([], 0)
-        columns = [*map(_simple, header)]
-        sensors, ambient = _matching(columns, self.sensors), _matching(columns, self.ambient)[:1]
-        named = {name: _matching(columns, *each)[:1] for name, each in self.columns.items()}
-        pairs = {
-            instrument: [_matching(columns, pattern)[:1] for pattern in patterns]
-            for instrument, patterns in self.instruments.items()
-        }
-        excluded = _matching(columns, "exclude")[:1] if self.bare else []
-        wanted = chain(sensors, ambient, excluded, *named.values(), *chain(*pairs.values()))
-        table = TextTable(head, self.delimiter, header, (), skip_lines, [])
-        cells = table.columns([*wanted])
-        remarks = [f"{self.name} export", *table.remarks]
-        draft = DraftLog(head.name, str(head.path), headings=tuple(header), remarks=remarks)
-        for quantity, found in named.items():
-            for place in found:
-                _take(draft, quantity, place, _values(draft, cells, place, quantity))
-        _take_pair(draft, cells, pairs)
-        for quantity in REQUIRED[:3]:
-            if quantity not in draft.values:
-                problem = f"no column of this file holds it (found: {shown_headings(header)})"
-                cure = "check the export, or convert it to a canonical log"
-                raise draft.error(quantity, problem, cure)
-        if self.charges:
-            draft.negate_current(f"{self.name} stores discharge as negative")
-        self._take_temperature(draft, cells, sensors, ambient)
+        simple = [*map(_simple, header)]
+        patterns = [*chain(*self.instruments.values(), *self.columns.values())]
+        excludes = ["exclude"] if self.bare else []
+        text = TextTable(head, self.delimiter, header, (), skip_lines, [])
+        wanted = _matching(simple, *patterns, self.sensors, self.ambient, *excludes)
+        cells = text.columns(wanted)
+        remarks = [f"{self.name} export", *text.remarks]
+        for place, column in cells.items():
+            if column.null_count == len(column):
+                remarks.append(f"{header[place]} is empty and was not used")
+                simple[place] = ""
+        driving, sensors = self._driving(simple), _matching(simple, self.sensors)
+        remarks += [
+            f"{FIELDS[name]} from the {each}" for name, (each, _) in driving.items() if each
+        ]
+        places = {name: [place] for name, (_, place) in driving.items()}
+        places |= {name: _matching(simple, *each)[:1] for name, each in self.columns.items()}
+        places["temperature"] = sensors or _matching(simple, self.ambient)[:1]
+        given = {name: "+".join(f"#{k + 1}" for k in each) for name, each in places.items() if each}
+        excluded = _matching(simple, *excludes)[:1]
         for place in excluded:
             words = cells[place].cast("string")  # a column of 0 is one of numbers
-            is_excluded = pc.fill_null(pc.equal(words, "Yes"), fill_value=False)
-            draft.keep(~np.asarray(is_excluded, dtype=bool), "that the cycler excludes dropped")
+            cells[place] = pc.fill_null(pc.equal(words, "Yes"), fill_value=False).cast("float64")
+        table = _table(head, header, {k: cells[k] for k in [*chain(*places.values()), *excluded]})
+        draft = draft_of_table(
+            table,
+            ColumnMap(given),
+            name=head.name,
+            source=str(head.path),
+            besides=dict.fromkeys(excluded, 1.0),
+        )
+        draft.remarks, draft.assumed, draft.in_seconds = [*remarks, *draft.remarks], [], False
+        draft.sign_by = "data" if driving["current"][0] == _CAN else "format"
+        if self.charges:
+            draft.negate_current(f"{self.name} stores discharge as negative")
+        self._note_temperature(draft, len(sensors))
+        for place in excluded:
+            is_excluded = draft.values.pop(f"{BESIDES}{header[place]}") > 0.0
+            draft.keep(~is_excluded, "that the cycler excludes dropped")
         if self.waits:
             is_waiting = draft.values["time_s"] < 0.0
             if is_waiting.all():
@@ -142,29 +151,32 @@ class Export:
             draft.keep(~is_waiting, "before time 0 (the wait before the test) dropped")
         return draft
 
-    def _take_temperature(
-        self,
-        draft: DraftLog,
-        cells: dict[int, Any],
-        sensors: Sequence[int],
-        ambient: Sequence[int],
-    ) -> None:
-        """Take the sensors, else the room's temperature or the set point, if any."""
+    def _driving(self, simple: Sequence[str]) -> dict[str, tuple[str, int]]:
+        """Return instrument and place of current and voltage: of the first that has both."""
+        taken: dict[str, tuple[str, int]] = {}
+        for instrument, pair in self.instruments.items():
+            own = {}
+            for quantity, pattern in zip(("current", "voltage"), pair, strict=True):
+                for place in _matching(simple, pattern)[:1]:
+                    own[quantity] = instrument, place
+            if len(own) == 2:
+                return own
+            taken = own | taken
+        return taken
+
+    def _note_temperature(self, draft: DraftLog, sensors: int) -> None:
+        """Note the place of the temperature; without sensors, take the set point, if any."""
         name = "temperature_c"
-        probes = {draft.headings[k]: _values(draft, cells, k, name) for k in sensors}
-        probes = {text: each for text, each in probes.items() if np.isfinite(each).any()}
-        if probes:
-            draft.take_probes([*probes], [*probes.values()])
-            draft.labels[name] = next(iter(probes))
-            draft.temperature_source = self.source
-            if len(probes) > 1:
-                draft.remarks.append(f"temperature: median of {len(probes)} columns")
-        for place in () if probes else ambient:
-            _take(draft, name, place, _values(draft, cells, place, name))
+        draft.temperature_source = self.source if sensors else "unknown"
+        if sensors > 1:
+            draft.remarks.append(f"temperature: median of {sensors} columns")
+        if sensors:
+            return
+        if name in draft.values:
             draft.temperature_source = "room"
             draft.remarks.append("temperature: the room's, not the battery's")
         found = [*re.finditer(self.set_point, Path(draft.source).name, re.IGNORECASE)]
-        if len(found) == 1 and not sensors:
+        if len(found) == 1:
             value_c = float(found[0]["value"])
             if found[0].groupdict().get("sign") == "N":
                 value_c = -value_c
@@ -174,47 +186,16 @@ class Export:
             draft.remarks.append(shown)
 
 
-def _take(draft: DraftLog, quantity: str, place: int, values: FloatArray) -> None:
-    draft.values[quantity] = values
-    draft.labels[quantity] = draft.headings[place]
+def _table(head: Head, header: Sequence[str], cells: dict[int, Any]) -> ArrowTable:
+    """Return a table of the chosen columns; the others have no heading."""
+
+    def read(names: list[str]) -> Any:
+        return pa.table({header[place]: column for place, column in cells.items()}).select(names)
+
+    headings = [text if place in cells else "" for place, text in enumerate(header)]
+    return ArrowTable(headings, read, source=str(head.path))
 
 
-def _values(draft: DraftLog, cells: dict[int, Any], place: int, quantity: str) -> FloatArray:
-    """Return a column in the canonical unit, with a remark if it is converted."""
-    text = draft.headings[place]
-    numbers, in_cells = numbers_of(cells[place], draft.source, text)
-    unit = parse_heading(text).unit or in_cells
-    values = convert(numbers, quantity, unit, source=draft.source, label=text)
-    if values is not numbers:
-        draft.remarks.append(f"{text}: converted from {unit} to {quantity}")
-    return values
-
-
-def _take_pair(draft: DraftLog, cells: dict[int, Any], pairs: dict[str, list[list[int]]]) -> None:
-    """Take current and voltage of the first instrument that has both."""
-    taken: dict[str, tuple[str, int, FloatArray]] = {}
-    for instrument, pair in pairs.items():
-        own = {}
-        for quantity, found in zip(_DRIVING, pair, strict=True):
-            for place in found:
-                values = _values(draft, cells, place, quantity)
-                if instrument and not np.isfinite(values).any():
-                    draft.remarks.append(f"{draft.headings[place]} is empty and was not used")
-                else:
-                    own[quantity] = instrument, place, values
-        if len(own) == len(_DRIVING):
-            taken = own
-            break
-        taken = own | taken
-    for quantity, (instrument, place, values) in sorted(taken.items()):
-        _take(draft, quantity, place, values)
-        if instrument:
-            draft.remarks.append(f"{quantity} from the {instrument}")
-        if quantity == "current_a" and instrument == _CAN:
-            draft.sign_by = "data"
-
-
-_DRIVING: Final = ("current_a", "voltage_v")
 _CAN: Final = "car's CAN"
 # D3's channels, the preferred first: instruments before copies from CAN.
 _INSTRUMENTS: Final = {
@@ -234,7 +215,7 @@ def _cycler(name: str, time: str, current: str, voltage: str, *more: str, **how:
     headings = time, current, voltage
     simple = [re.escape(_simple(heading)) for heading in headings]
     known_by = tuple(map(re.escape, (*headings, *more)))
-    return Export(name, known_by, {"time_s": (simple[0],)}, {"": (simple[1], simple[2])}, **how)
+    return Export(name, known_by, {"time": (simple[0],)}, {"": (simple[1], simple[2])}, **how)
 
 
 _SIGNED: Final = r"_(?P<sign>[NP])(?P<value>\d\d)(?=[_.])"
@@ -244,7 +225,7 @@ READERS: Final = (
     Export(
         "BMW i3",
         (r"time \[s\]", r"battery voltage \[.*"),
-        {"time_s": ("time",), "soc_pct": ("soc",)},
+        {"time": ("time",), "soc": ("soc",)},
         {"": ("batterycurrent", "batteryvoltage")},
         delimiter=";",
         sensors="batterytemperature",
@@ -257,8 +238,8 @@ READERS: Final = (
         "ANL D3",
         (r"(daq[ _]?)?time(stamp)?\s*(\[.*|__.*)?", "(hv[ _]?batt|dyno).*"),
         {
-            "time_s": (r"time(stamp)?", "daqtime"),
-            "soc_pct": ("hvbatterysoc", r"hvbatt(ery)?soc(can\d*)?"),
+            "time": (r"time(stamp)?", "daqtime"),
+            "soc": ("hvbatterysoc", r"hvbatt(ery)?soc(can\d*)?"),
         },
         _INSTRUMENTS,
         delimiter="\t",

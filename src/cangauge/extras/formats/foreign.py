@@ -116,7 +116,7 @@ _FORMATS: Final = (
     ),
 )
 _FRAME_IDS: Final = {"id", "can id", "arb id", "identifier", "帧id"}
-_FRAME_BYTES: Final = {"d0", "d1", "b1", "data", "data bytes", "数据(hex)"}
+_FRAME_BYTES: Final = {"d0", "d1", "b1", "data", "data bytes", "dlc", "len", "数据(hex)"}
 
 
 def foreign_format(data: bytes) -> tuple[str, str] | None:

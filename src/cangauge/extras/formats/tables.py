@@ -229,32 +229,26 @@ class LongTable(Channels):
         return np.searchsorted(ends_s, at_s, side="right")
 
     def at(self, name: str, rows_s: FloatArray, quantity: str) -> FloatArray:
-        """Return the nearest values of polled series, the latest of others."""
-        at_rows = self._nearest if self._is_polled else self._latest
-        return at_rows(name, rows_s, is_driving=quantity in DRIVING)
+        """Return the nearest values of polled series, the latest of others.
 
-    def _latest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
-        """Return the latest value at some times; of current and voltage only those that hold.
-
-        Of others the first value also holds before it.
+        Of current and voltage only those that are near, or that hold; of others, the first value
+        also holds before it.
         """
         stamps_s, values = self._by_name[name]
-        if not is_driving:
+        if quantity not in DRIVING:
             known = np.isfinite(values)
             stamps_s, values = stamps_s[known], values[known]
-        place = np.maximum(np.searchsorted(stamps_s, at_s, side="right") - 1, 0)
-        holds = (at_s >= stamps_s[place]) & (self._session(at_s) == self._session(stamps_s)[place])
-        return values[place] if not is_driving else np.where(holds, values[place], np.nan)
-
-    def _nearest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
-        """Return the value nearest to some times; of current and voltage only if it is near."""
-        stamps_s, values = self._by_name[name]
-        after = np.clip(np.searchsorted(stamps_s, at_s), 0, stamps_s.size - 1)
-        before = np.maximum(after - 1, 0)
-        is_before = np.abs(at_s - stamps_s[before]) <= np.abs(stamps_s[after] - at_s)
-        place = np.where(is_before, before, after)
-        is_near = np.abs(stamps_s[place] - at_s) <= BRIDGE_S
-        return np.where(is_near | (not is_driving), values[place], np.nan)
+        if self._is_polled:
+            after = np.minimum(np.searchsorted(stamps_s, rows_s), stamps_s.size - 1)
+            before = np.maximum(after - 1, 0)
+            is_before = np.abs(rows_s - stamps_s[before]) <= np.abs(stamps_s[after] - rows_s)
+            place = np.where(is_before, before, after)
+            holds = np.abs(stamps_s[place] - rows_s) <= BRIDGE_S
+        else:
+            place = np.maximum(np.searchsorted(stamps_s, rows_s, side="right") - 1, 0)
+            is_recorded = self._session(rows_s) == self._session(stamps_s)[place]
+            holds = is_recorded & (rows_s >= stamps_s[place])
+        return np.where(holds | (quantity not in DRIVING), values[place], np.nan)
 
 
 def _rows_by_name(names: Any) -> Iterator[tuple[str, IntArray]]:
