@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._typing import IntArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.diagnosis.pack import (
     RIDGE,
     Healthy,
@@ -21,7 +21,6 @@ from cangauge.diagnosis.pack import (
 )
 from cangauge.diagnosis.rows import COVER_PCT, Trace
 from cangauge.diagnosis.shapes import Shape
-from cangauge.model.gaussian import Rows
 from cangauge.model.model_file import Model
 
 VISIBLE_NATS: Final = 6.0
@@ -89,13 +88,13 @@ class Evidence:
     def parameters(self) -> dict[str, Quantity]:
         """Parameters of the effect, with the 95 % interval of its amplitude."""
         shape, half = self.shape, self.half_width
-        values = shape.values(self.size)
-        of = values[shape.name]
-        found = {
-            item.name: Quantity(values[item.name], None, item.unit)
-            for item in shape.effect.parameters
-        }
-        return found | {shape.name: Quantity(of, (of - half, of + half), shape.unit)}
+        found = {}
+        for item in shape.effect.parameters:
+            value, ci = shape.values(self.size)[item.name], None
+            if item.name == shape.name:
+                ci = (value - half, value + half)
+            found[item.name] = Quantity(value, ci, item.unit)
+        return found
 
 
 def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
@@ -106,15 +105,15 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
     """
     at = _trials(healthy.tried, len(logs))
     tried = [healthy.tried[k] for k in at.max(axis=1)]
-    n, rows = healthy.n, _design(healthy, logs, at)
-    left = rows.eliminated(n).table
+    n = healthy.n
+    R = np.asarray(np.linalg.qr(_design(healthy, logs, at), mode="r"))
+    left = R[n:, n:]  # δ integrated out
     # Gradient and curvature of the log likelihood of each trial's size, about zero.
     g, s = left[:, :-1].T @ left[:, -1], np.maximum(np.sum(left[:, :-1] ** 2, axis=0), 1e-9)
     bounds = np.array([_bounds(shape, logs) for shape in tried])
     size = np.clip(g / (s + RIDGE), *bounds.T)
     gain = g * size - 0.5 * s * size**2
     chi2 = g**2 / (s + RIDGE)
-    R = np.asarray(np.linalg.qr(rows.table, mode="r"), dtype=np.float64)
     solved = np.linalg.solve(R[:n, :n], R[:n, n:])
     found = {}
     names = np.array([shape.effect.id for shape in tried])
@@ -150,7 +149,7 @@ def _shapes_in(
     )
 
 
-def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> Rows:
+def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> FloatArray:
     """Return the rows of δ and of each trial: of the references, the logs, and their own SoC."""
     n, number = healthy.n, len(at)
     tables = [np.insert(healthy.delta.table, [n] * number, 0.0, axis=1)]
@@ -162,7 +161,7 @@ def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> Rows:
             counts = np.array([_moved(shape, healthy, log, beyond) for shape in healthy.tried])
             counts = np.where(column >= 0, counts[column], 0.0)
             tables.append(np.r_[np.zeros(n), counts, beyond][None, :])
-    return Rows(np.concatenate(tables), 0.0).reduced()
+    return np.concatenate(tables)
 
 
 def _moved(shape: Shape, healthy: Healthy, log: LogRows, beyond: float) -> float:
@@ -203,12 +202,12 @@ def learn(model: Model, references: Sequence[Trace]) -> Healthy:
     stated_v = model.noise.voltage_rmse_v
     if not references:
         return of_model(model, stated_v)
-    healthy, logs, is_judged = corrected_by(references, model)
+    healthy, logs = corrected_by(references, model)
     every = [healthy.delta_rows_of(log) for log in logs]
     left_out = [
         (log, replace(healthy, delta=total(healthy.delta, every[:k] + every[k + 1 :])))
         for k, log in enumerate(logs)
-        if is_judged[k]
+        if log.is_covered
     ]
     healthy = replace(healthy, delta=total(healthy.delta, every))
     if len(left_out) < 2:

@@ -83,6 +83,8 @@ class LogRows:
     """Number of deviations."""
     kept: IntArray
     """The rows that count, of those that take part."""
+    is_covered: bool
+    """Whether other logs visit enough of its SoC to judge it."""
     columns: FloatArray
     """Of the rows that count, each times the root of its seconds."""
     rows: Rows
@@ -106,7 +108,8 @@ def log_rows(
     of = Simulated(model, log)
     soc, residual_v = of.plain.soc_pct[log.rows], of.plain.residual_v
     near = covered(soc, visited)
-    if near.mean() < LEAST_COVERED:
+    is_covered = bool(near.mean() >= LEAST_COVERED)
+    if not is_covered:
         near[:] = True
     kept = np.flatnonzero(near & without_outliers(residual_v, model.pack.voltage_v))
     by_shape = shape_columns(of, tried)
@@ -120,8 +123,9 @@ def log_rows(
         of,
         deviations.shape[1] + beside.shape[1],
         kept,
+        is_covered,
         table,
-        Rows.of(table[:, :-1], table[:, -1], 1.0),
+        Rows(table, 0.0).reduced(),
     )
 
 
@@ -297,10 +301,8 @@ def _prior_rows(
     return Rows(table, 0.0)
 
 
-def corrected_by(
-    references: Sequence[Trace], given: Model
-) -> tuple[Healthy, list[LogRows], list[bool]]:
-    """Return the healthy pack by references, their rows, and which of them can be judged.
+def corrected_by(references: Sequence[Trace], given: Model) -> tuple[Healthy, list[LogRows]]:
+    """Return the healthy pack by references, and their rows.
 
     The model is corrected to the posterior mean of all references, with the prior of the fit. About
     that model δ has its prior again, now with the effects of a healthy pack.
@@ -308,12 +310,15 @@ def corrected_by(
     model = with_all_loads(given.extended_model())
     logs = [log_rows(model, log, (), ()) for log in references]
     visited = [log.simulated.plain.soc_pct[log.trace.rows] for log in logs]
-    mean_v, mean_soc_pct = _means(logs, visited)
+    seconds = [log.seconds for log in logs]
+    volts = [log.log.voltage_v[log.rows].mean() for log in references]
+    mean_v = float(np.average(volts, weights=seconds))
+    mean_soc_pct = float(np.average([soc.mean() for soc in visited], weights=seconds))
 
     known = prior(model, given, mean_v, mean_soc_pct)
     first = Healthy(model, (), _prior_rows(known, 1.0, 1.0, ()), (FIRST_NOISE * mean_v) ** 2)
     least_v2 = (LEAST_NOISE * mean_v) ** 2
-    first = _tuned(first, logs, [len(logs) > 1] * len(logs), known, least_v2)
+    first = _tuned(first, logs, known, least_v2)
     every = total(first.delta, [first.rows_of(log) for log in logs])
 
     model = corrected(model, every.posterior().mean)
@@ -322,7 +327,6 @@ def corrected_by(
     logs = [
         log_rows(model, log, tried, others) for log, others in zip(references, around, strict=True)
     ]
-    is_judged = [_is_covered(soc, others) for soc, others in zip(visited, around, strict=True)]
     known = prior(model, given, mean_v, mean_soc_pct)
     healthy = Healthy(
         model,
@@ -333,29 +337,12 @@ def corrected_by(
         tuple(visited),
         soc_ratio=_soc_ratio(logs),
     )
-    return _tuned(healthy, logs, is_judged, known, least_v2), logs, is_judged
-
-
-def _means(logs: Sequence[LogRows], visited: Sequence[FloatArray]) -> tuple[float, float]:
-    """Return mean voltage [V] and SoC [%] of logs, each weighed by its time."""
-    seconds = np.array([log.seconds for log in logs])
-    volts = [float(np.mean(log.trace.log.voltage_v[log.trace.rows])) for log in logs]
-    soc_pct = [soc.mean() for soc in visited]
-    mean_v, mean_soc_pct = (
-        float(seconds @ each) / float(seconds.sum()) for each in (volts, soc_pct)
-    )
-    return mean_v, mean_soc_pct
-
-
-def _is_covered(soc_pct: FloatArray, others: Sequence[FloatArray]) -> bool:
-    """Return whether other references visit enough of a reference's SoC to judge it."""
-    return bool(others and covered(soc_pct, others).mean() >= LEAST_COVERED)
+    return _tuned(healthy, logs, known, least_v2), logs
 
 
 def _tuned(
     healthy: Healthy,
     logs: Sequence[LogRows],
-    is_judged: Sequence[bool],
     known: tuple[FloatArray, FloatArray],
     least_v2: float,
 ) -> Healthy:
@@ -363,7 +350,7 @@ def _tuned(
 
     Twice, since the weight of the rows follows from the noise, of `least_v2` at least [V²].
     """
-    judged = [k for k, each in enumerate(is_judged) if each]
+    judged = [k for k, log in enumerate(logs) if log.is_covered and len(logs) > 1]
     for _ in range(2):
         every = [_gram(healthy.delta_rows_of(log)) for log in logs]
         best, least = (healthy.delta, healthy.s2), np.inf
