@@ -31,41 +31,46 @@ def errors_of(given: Sequence[Simulated], logs: Sequence[LogRows]) -> Errors:
     """Return the errors of simulated logs on the rows that count."""
     parts = []
     for k, (log, of) in enumerate(zip(logs, given, strict=True)):
-        at, signals = log.trace.rows[log.kept], of.signals
+        at, time_s = log.trace.rows[log.kept], of.signals.time_s
+        error_v = of.plain.residual_v[log.kept]
         parts.append(
             (
                 np.full(at.size, k),
-                signals.time_s[at] - signals.time_s[0],
-                signals.current_a[at],
-                signals.temperature_c[at],
+                time_s[at] - time_s[0],
+                of.signals.current_a[at],
+                of.signals.temperature_c[at],
                 of.plain.soc_pct[at],
-                of.plain.residual_v[log.kept],
-                of.plain.residual_v[log.kept],
+                error_v,
+                error_v,
             )
         )
     return Errors(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def soc_errors_pct(model: Model, log: LogRows) -> tuple[FloatArray, FloatArray]:
-    """Return absolute error and standard deviation of the SoC, start withheld [%].
+def soc_errors_pct(model: Model, logs: Sequence[LogRows]) -> FloatArray:
+    """Return absolute error and standard deviation of the SoC, start withheld [%], shape (2, m).
 
-    On the rows that count. The error is NaN while the estimate settles, where it gives no SoC, and
-    for a log that mostly has none.
+    On the rows that count. Both are NaN for a log that mostly has no SoC, and the error while the
+    estimate settles.
     """
-    of, own_pct = log.trace.log, log.trace.log.soc_pct
-    at = log.trace.rows[log.kept]
-    if own_pct is None or np.isfinite(own_pct).mean() < 0.5:
-        return np.full(at.size, np.nan), np.full(at.size, np.nan)
-    known = np.isfinite(own_pct)
+    return np.concatenate([_soc_errors_of_log_pct(model, log) for log in logs], axis=1)
+
+
+def _soc_errors_of_log_pct(model: Model, log: LogRows) -> FloatArray:
+    of, at = log.trace.log, log.trace.rows[log.kept]
+    known = np.isfinite(np.full(len(of), np.nan) if of.soc_pct is None else of.soc_pct)
+    if of.soc_pct is None or known.mean() < 0.5:
+        return np.full((2, at.size), np.nan)
     table = estimate(replace(of, soc_pct=None), model, initial_soc_pct="auto")
-    error_pct = np.abs(table.soc_pct - np.interp(of.time_s, of.time_s[known], own_pct[known]))
+    own_pct = np.interp(of.time_s, of.time_s[known], of.soc_pct[known])
     is_settled = of.time_s - of.time_s[0] >= SETTLING_S
-    return np.where(is_settled, error_pct, np.nan)[at], table.soc_std_pct[at]
+    error_pct = np.where(is_settled, np.abs(table.soc_pct - own_pct), np.nan)
+    return np.stack([error_pct[at], table.soc_std_pct[at]])
 
 
 def mean_errors(before: FloatArray, after: FloatArray) -> tuple[float, float]:
     """Return the means of two errors on the rows where both are known; NaN where none is."""
-    known = np.isfinite(before) & np.isfinite(after)
+    known = np.isfinite(before + after)
     if not known.any():
         return math.nan, math.nan
     return float(before[known].mean()), float(after[known].mean())
@@ -114,28 +119,21 @@ class HeldOut:
     Parameters
     ----------
     model : Model
-    extended : ExtendedModel
-        The same model.
     healthy : Healthy
     logs : sequence of LogRows
     """
 
-    def __init__(
-        self, model: Model, extended: ExtendedModel, healthy: Healthy, logs: Sequence[LogRows]
-    ) -> None:
-        self._model, self._extended, self._logs = model, extended, logs
-        self._simulated = [Simulated(extended, log.trace) for log in logs]
+    def __init__(self, model: Model, healthy: Healthy, logs: Sequence[LogRows]) -> None:
+        self._model, self._logs, self.extended = model, logs, model.extended_model()
+        self._simulated = [Simulated(self.extended, log.trace) for log in logs]
         self._folds = folds(healthy, logs)
         self.errors = errors_of(self._simulated, logs)
         """Without a correction."""
 
     @cached_property
-    def soc(self) -> tuple[FloatArray, FloatArray]:
+    def soc(self) -> FloatArray:
         """SoC errors without a correction, and the standard deviations of the SoC [%]."""
-        errors_pct, std_pct = zip(
-            *(soc_errors_pct(self._model, log) for log in self._logs), strict=True
-        )
-        return np.concatenate(errors_pct), np.concatenate(std_pct)
+        return soc_errors_pct(self._model, self._logs)
 
     def correction(self, evidence: Evidence) -> Correction:
         """Return the correction by an effect."""
@@ -182,8 +180,9 @@ class HeldOut:
         return corrected.residual_v[self._logs[k].kept]
 
     def _soc_errors_pct(self, rmse_v: float, k: int, shape: Shape, size: float) -> FloatArray:
-        corrected = added(self._extended, shape.effect, shape.values(size))
-        return soc_errors_pct(model_file(self._model, corrected, rmse_v), self._logs[k])[0]
+        corrected = added(self.extended, shape.effect, shape.values(size))
+        model = model_file(self._model, corrected, rmse_v)
+        return np.asarray(soc_errors_pct(model, [self._logs[k]])[0])
 
 
 def model_file(given: Model, corrected: ExtendedModel, rmse_v: float) -> Model:

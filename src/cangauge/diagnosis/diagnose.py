@@ -9,11 +9,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
-from cangauge._typing import FloatArray
 from cangauge.diagnosis import text
 from cangauge.diagnosis.as_json import as_json
 from cangauge.diagnosis.checks import check_logs
@@ -91,12 +89,6 @@ class Diagnosis:
         return self.model_check is not None and bool(self.model_check.missed)
 
     @cached_property
-    def _healthy_extended(self) -> ExtendedModel:
-        """The model as given, extended by the effects that it misses on the healthy logs."""
-        check = self.model_check
-        return self.model.extended_model() if check is None else check.corrected
-
-    @cached_property
     def _baseline(self) -> Errors:
         """Errors by the model as given."""
         return self._errors_by(self.model.extended_model())
@@ -107,7 +99,7 @@ class Diagnosis:
     @cached_property
     def _held_out(self) -> HeldOut:
         """The logs by the model of the healthy logs, to judge corrections."""
-        return HeldOut(self._healthy_model, self._healthy_extended, self.healthy, self.rows)
+        return HeldOut(self._healthy_model, self.healthy, self.rows)
 
     @cached_property
     def corrections(self) -> dict[str, Correction]:
@@ -152,11 +144,10 @@ class Diagnosis:
         """
         if "start" in self.posterior.stated:
             return None
-        before = after = self._soc_errors_pct(self.model)
+        after = self._held_out.soc[0]
+        before = soc_errors_pct(self.model, self.rows)[0] if self.lacks else after
         if self.correction is not None:
             after = self._held_out.corrected_soc_errors_pct(self.correction)
-        elif self.lacks:
-            after = self._soc_errors_pct(self._healthy_model)
         means = mean_errors(before, after)
         return None if math.isnan(means[0]) else means
 
@@ -164,9 +155,6 @@ class Diagnosis:
         """Return the mean SoC errors of left-out rows without and with a correction [%]."""
         after = self._held_out.corrected_soc_errors_pct(correction)
         return mean_errors(self._held_out.soc[0], after)
-
-    def _soc_errors_pct(self, model: Model) -> FloatArray:
-        return np.concatenate([soc_errors_pct(model, log)[0] for log in self.rows])
 
     @property
     def errors(self) -> Errors:
@@ -225,21 +213,19 @@ class Diagnosis:
     @cached_property
     def extended_model(self) -> Model:
         """The corrected model, ready to save and run; the given one without a correction."""
-        if self.correction is None or self.correction.is_of_log:
+        best = self.correction
+        if best is None or best.is_of_log:
             return self._healthy_model
-        return self._file(self.correction)
+        return model_file(self.model, best.applied(self._held_out.extended), best.rmse_v)
 
     @cached_property
     def _healthy_model(self) -> Model:
         """The model that describes the healthy logs: the given one where nothing is missed."""
-        if not self.lacks:
+        check = self.model_check
+        if check is None or not check.missed:
             return self.model
-        left_v = rms(self._errors_by(self._healthy_extended).before_v)
-        return model_file(self.model, self._healthy_extended, left_v)
-
-    def _file(self, correction: Correction) -> Model:
-        """Return the model of the healthy logs with a correction."""
-        return model_file(self.model, correction.applied(self._healthy_extended), correction.rmse_v)
+        left_v = rms(self._errors_by(check.corrected).before_v)
+        return model_file(self.model, check.corrected, left_v)
 
     @property
     def summary(self) -> str:
