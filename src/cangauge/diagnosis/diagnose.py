@@ -29,7 +29,7 @@ from cangauge.diagnosis.next_step import next_step
 from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
 from cangauge.diagnosis.posterior import ALARM, Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, trace
-from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
+from cangauge.diagnosis.simulator import Simulation, simulator_gap
 from cangauge.diagnosis.sizes import sized_by_simulation
 from cangauge.diagnosis.where import Errors, closed_part, excesses, rms
 from cangauge.errors import InputError
@@ -73,15 +73,10 @@ class Diagnosis:
     """Whether the model describes the references; None with fewer than two."""
     remarks: tuple[str, ...] = ()
     """What was assumed to diagnose these logs."""
-    simulator: SimulatorGap | None = None
-    """The simulator whose gap it is; None: the gap of `model`."""
+    simulator: str | None = None
+    """Of a simulator, where it is off everywhere, "" for nowhere; None: the gap of `model`."""
     correction_path: str | None = None
     """File of the corrected model, as the text names it."""
-
-    @property
-    def has_references(self) -> bool:
-        """Whether references show what a healthy log is."""
-        return bool(self.healthy.references)
 
     @property
     def lacks(self) -> bool:
@@ -309,8 +304,7 @@ def diagnose(
         model = None if model is None else as_model(model)
         own = () if isinstance(references, Healthy) else _as_logs(references)
         if simulation is not None:
-            simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
-            logs, own, model = simulator.logs, simulator.references, simulator.model
+            logs, own, model, simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
         if model is None:
             cure = "give a model (--model), or a simulation (--simulated, --simulator)"
             raise InputError("no model", field="model", cure=cure)

@@ -91,7 +91,7 @@ class Evidence:
         found = {}
         for item in shape.effect.parameters:
             value, ci = shape.values(self.size)[item.name], None
-            if item.name == shape.name:
+            if item is shape.amplitude:
                 ci = (value - half, value + half)
             found[item.name] = Quantity(value, ci, item.unit)
         return found
@@ -127,7 +127,10 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
         )
         visible = np.sqrt(2.0 * VISIBLE_NATS * o / s[mine]) * [tried[j].bound for j in mine]
         found[name] = Evidence(
-            _shapes_in(logs, healthy.tried, at[top]),
+            tuple(
+                None if k < 0 else healthy.tried[k].in_log(log.trace.log.duration_s)
+                for log, k in zip(logs, at[top].tolist(), strict=True)
+            ),
             nats=float(gain[top]),
             left_v2=square_v2 / total_s(logs),
             size=float(size[top]) * bound,
@@ -137,16 +140,6 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> dict[str, Evidence]:
             bounds=(float(bounds[top, 0]), float(bounds[top, 1])),
         )
     return found
-
-
-def _shapes_in(
-    logs: Sequence[LogRows], tried: Sequence[Shape], columns: IntArray
-) -> tuple[Shape | None, ...]:
-    """Return a trial's shape in each log; None where the log has no column of it (−1)."""
-    return tuple(
-        None if k < 0 else tried[k].in_log(log.trace.log.duration_s)
-        for log, k in zip(logs, columns.tolist(), strict=True)
-    )
 
 
 def _design(healthy: Healthy, logs: Sequence[LogRows], at: IntArray) -> FloatArray:
@@ -204,6 +197,7 @@ def learn(model: Model, references: Sequence[Trace]) -> Healthy:
         return of_model(model, stated_v)
     healthy, logs = corrected_by(references, model)
     every = [healthy.delta_rows_of(log) for log in logs]
+    # Each reference that the others cover, and the healthy pack without it.
     left_out = [
         (log, replace(healthy, delta=total(healthy.delta, every[:k] + every[k + 1 :])))
         for k, log in enumerate(logs)
@@ -212,14 +206,6 @@ def learn(model: Model, references: Sequence[Trace]) -> Healthy:
     healthy = replace(healthy, delta=total(healthy.delta, every))
     if len(left_out) < 2:
         return replace(healthy, s2=max(healthy.s2, stated_v**2))
-    return _calibrated(healthy, left_out)
-
-
-def _calibrated(healthy: Healthy, left_out: Sequence[tuple[LogRows, Healthy]]) -> Healthy:
-    """Return the healthy pack with what left-out references show by the others: error and excess.
-
-    `left_out` holds each reference, and the healthy pack without it.
-    """
     found = [analyse(others, [log]) for log, others in left_out]
     chi2 = {name: np.array([one[name].chi2 for one in found]) for name in found[0]}
     usual = max(1.0, float(np.median([x.mean() for x in chi2.values()])))

@@ -48,10 +48,9 @@ def coefficients(model: ExtendedModel) -> FloatArray:
 
 def coefficient_columns(of: Simulated) -> FloatArray:
     """Return the change of voltage by each coefficient on the rows of a log, shape (m, p)."""
-    rows, true = of.trace.rows, of.plain.signals
-    currents_a = of.model.model.currents(true.time_s, true.current_a, rows)
-    load = of.model.model.load_columns(true.temperature_c[rows], currents_a)
-    return np.column_stack([hermite_basis(of.plain.soc_pct[rows]), load])
+    rows, plain = of.trace.rows, of.plain
+    load = of.model.model.load_columns(plain.signals.temperature_c[rows], plain.currents_a)
+    return np.column_stack([hermite_basis(plain.soc_pct[rows]), load])
 
 
 def corrected(model: ExtendedModel, change: FloatArray) -> ExtendedModel:

@@ -100,19 +100,17 @@ class Simulated:
     def __init__(self, model: ExtendedModel, trace: Trace) -> None:
         self.model, self.trace = model, trace
         self.signals = Signals.of(trace.log)
-        self.currents_a = model.model.currents(trace.log.time_s, trace.log.current_a, slice(None))
-        self.plain = self._predict(model, self.signals, self.currents_a)
+        self._currents_a = model.model.currents(trace.log.time_s, trace.log.current_a, slice(None))
+        self.plain = self._predict(model, self.signals)
 
-    def _predict(
-        self, model: ExtendedModel, signals: Signals, currents_a: FloatArray | None = None
-    ) -> Prediction:
-        at = self.trace
+    def _predict(self, model: ExtendedModel, signals: Signals) -> Prediction:
+        at, currents_a = self.trace, self._currents_a if signals is self.signals else None
         return model.predict(signals, at.start_pct, at.rows, currents_a=currents_a)
 
     def with_effect(self, effect: Effect, values: Values) -> Prediction:
         """Return the prediction by the model with one more effect."""
         if not effect.moves_time:
-            return self._predict(added(self.model, effect, values), self.signals, self.currents_a)
+            return self._predict(added(self.model, effect, values), self.signals)
         context = effect.context(values, self.model.model, self.model.pack)
         moved = effect.correct(self.trace.original, values, context._replace(is_whole=True))
         return self._predict(self.model, _means(moved, self.trace.second))

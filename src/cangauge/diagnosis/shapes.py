@@ -16,7 +16,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.rows import Simulated
-from cangauge.model.effects.base import Effect, Inputs, Pack
+from cangauge.model.effects.base import Effect, Inputs, Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates
 
 STEP_ID: Final = "resistance_step"
@@ -37,14 +37,11 @@ class Shape:
     ----------
     effect : Effect
         Its `fault` is the fault.
-    name : str
-        Of the amplitude.
+    amplitude : Parameter
     fixed : dict of str to float
-        The other parameters.
-    neutral : float
-        Amplitude that changes nothing.
+        All parameters, with an amplitude that changes nothing.
     low, high : float
-        Bounds of the amplitude relative to `neutral`.
+        Bounds of the amplitude relative to that.
     about : float
         Size of the finite difference.
     usual : float
@@ -54,9 +51,8 @@ class Shape:
     """
 
     effect: Effect
-    name: str
+    amplitude: Parameter
     fixed: Mapping[str, float]
-    neutral: float
     low: float
     high: float
     about: float
@@ -71,11 +67,12 @@ class Shape:
     @property
     def unit(self) -> str:
         """Unit of the amplitude."""
-        return next(item.unit for item in self.effect.parameters if item.name == self.name)
+        return self.amplitude.unit
 
     def values(self, size: float) -> dict[str, float]:
         """Return the effect's parameters at a size relative to neutral."""
-        return {**self.fixed, self.name: self.neutral + size}
+        name = self.amplitude.name
+        return {**self.fixed, name: self.fixed[name] + size}
 
     @property
     def healthy_std(self) -> float:
@@ -94,32 +91,29 @@ class Shape:
 def shapes(pack: Pack) -> tuple[Shape, ...]:
     """Return every shape of every effect, a step of resistance at each place of a log last."""
     found = []
-    for effect in LIBRARY.values():
-        grids = {item.name: item.trials(pack) for item in effect.shapes if effect.amplitudes}
+    for item in candidates(tuple(LIBRARY.values()), pack):
+        grids = {each.name: each.grid for each in item.effect.shapes}
         # A switch refines a shape that has a grid; its first value is tried.
-        first = {
-            name: values[0] for name, values in grids.items() if len(values) < 3 and len(grids) > 1
-        }
-        for item in candidates([effect], pack):
-            if all(item.shape.get(name) == value for name, value in first.items()):
-                found += _shapes_of(item, pack)
-    steps = [shape for shape in found if shape.effect.id == STEP_ID]
+        if len(grids) == 1 or all(
+            item.shape.get(name, grid[0]) == grid[0]
+            for name, grid in grids.items()
+            if len(grid) < 3
+        ):
+            found += _shapes_of(item, pack)
     others = [shape for shape in found if shape.effect.id != STEP_ID]
+    steps = [shape for shape in found if shape.effect.id == STEP_ID]
     return (*others, *(replace(step, place=part) for step in steps for part in PLACES))
 
 
 def _shapes_of(item: EffectCandidate, pack: Pack) -> list[Shape]:
     """Return the shapes of an effect with one trial value of each other parameter."""
-    effect, neutral = item.effect, dict(zip(item.amplitudes, item.neutral.tolist(), strict=True))
-    usual = {each.name: each.healthy_std * each.factor(pack) for each in effect.parameters}
-    if item.shape.get("delayed") == 0.0:
-        usual = dict.fromkeys(usual, 0.0)
-    fixed = {**neutral, **item.shape}
-    sizes = zip(item.amplitudes, item.bounds.tolist(), item.steps.tolist(), strict=True)
-    found = [
-        Shape(effect, name, fixed, neutral[name], low, high, step, usual[name])
-        for name, (low, high), step in sizes
-    ]
+    effect, found = item.effect, []
+    fixed = item.values(np.zeros_like(item.neutral))
+    amplitudes = effect.amplitudes or effect.parameters[:1]
+    sizes = zip(amplitudes, item.bounds.tolist(), item.steps.tolist(), strict=True)
+    for amplitude, (low, high), step in sizes:
+        usual = amplitude.healthy_std * amplitude.factor(pack) * fixed.get("delayed", 1.0)
+        found.append(Shape(effect, amplitude, fixed, low, high, step, usual))
     if effect.moves_time:
         for about in SECANTS_S:
             low, high = sorted((0.0, 1.5 * about))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -84,55 +84,45 @@ def _pybamm_v(simulation: Any, log: Log, start_pct: float) -> FloatArray:
     return np.asarray(solution["Battery voltage [V]"](t=time_s))
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatorGap:
-    """Measured logs and what a simulator made of their current and temperature."""
-
-    logs: tuple[Log, ...]
-    """Diagnosed logs with the voltage of `model` plus the simulator's difference."""
-    references: tuple[Log, ...]
-    model: Model
-    """Identified on the simulator's output."""
-    remark: str
-    """Where the simulator is off everywhere; "" else."""
-
-
 def simulator_gap(
     logs: Sequence[Log],
     references: Sequence[Log],
     simulation: Simulation,
     model: Model | None = None,
     capacity_ah: float | None = None,
-) -> SimulatorGap:
-    """Return the gap of a simulator as that of a model, by default identified on its output."""
+) -> tuple[tuple[Log, ...], tuple[Log, ...], Model, str]:
+    """Return the gap of a simulator as that of a model, by default identified on its output.
+
+    Returns
+    -------
+    logs, references : tuple of Log
+        With the voltage of `model` plus the simulator's difference.
+    model : Model
+    remark : str
+        Where the simulator is off everywhere; "" else.
+    """
     every, number = (*logs, *references), len(logs)
     volts = [simulated_v(simulation, log) for log in every]
     outputs = [replace(log, voltage_v=each) for log, each in zip(every, volts, strict=True)]
     if model is None:
         model = fit(outputs, capacity_ah=capacity_ah).model
-    on_model = [
+    on_model = tuple(
         replace(log, voltage_v=model.predict(output).voltage_v + log.voltage_v - output.voltage_v)
         for log, output in zip(every, outputs, strict=True)
-    ]
-    return SimulatorGap(
-        logs=tuple(on_model[:number]),
-        references=tuple(on_model[number:]),
-        model=model,
-        remark=_level_remark(every, volts, number),
     )
+    gap_v = np.concatenate([log.voltage_v - each for log, each in zip(logs, volts, strict=False)])
+    remark = _level_remark(gap_v, float(np.mean(logs[0].voltage_v)))
+    return on_model[:number], on_model[number:], model, remark
 
 
-def _level_remark(logs: Sequence[Log], volts: Sequence[FloatArray], number: int) -> str:
-    """Return where a simulator is off everywhere, which comes before any cause; "" else."""
-    gaps = [log.voltage_v - each for log, each in zip(logs, volts, strict=True)]
-    for some, where in ((gaps[number:], ", on the references too"), (gaps[:number], "")):
-        whole = np.concatenate(some) if some else np.zeros(1)
-        mean, varies = float(whole.mean()), float(whole.std())
-        if abs(mean) > max(LEVEL_PART * float(np.mean(logs[0].voltage_v)), varies):
-            return (
-                f"The simulator is {significant(abs(mean), 2, 'V')}"
-                f" {'too low' if mean > 0.0 else 'too high'} everywhere{where}, and varies by"
-                f" {significant(varies, 2, 'V')} about that. Correct its level first: the"
-                " open-circuit voltage, the number of cells or the initial SoC."
-            )
-    return ""
+def _level_remark(gap_v: FloatArray, usual_v: float) -> str:
+    """Return that a simulator is off everywhere, which comes before any cause; "" else."""
+    mean, varies = float(gap_v.mean()), float(gap_v.std())
+    if abs(mean) <= max(LEVEL_PART * usual_v, varies):
+        return ""
+    return (
+        f"The simulator is {significant(abs(mean), 2, 'V')}"
+        f" {'too low' if mean > 0.0 else 'too high'} everywhere, and varies by"
+        f" {significant(varies, 2, 'V')} about that. Correct its level first: the"
+        " open-circuit voltage, the number of cells or the initial SoC."
+    )

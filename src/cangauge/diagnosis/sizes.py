@@ -45,21 +45,19 @@ class SizeProfile:
     def __init__(
         self, healthy: Healthy, logs: Sequence[LogRows], inside: Sequence[BoolArray]
     ) -> None:
-        self._healthy, self._logs = healthy, logs
-        n, known = healthy.n, healthy.delta.table
-        used = [k for k, rows in enumerate(inside) if rows.any()]
-        size = n + sum(logs[k].m for k in used)
+        self._healthy, self._logs, self._parts = healthy, logs, []
+        known = healthy.delta.table.T @ healthy.delta.table
+        n = size = healthy.n
+        for k, rows in enumerate(inside):
+            if rows.any():
+                m = logs[k].m
+                X = logs[k].columns[rows, : m + n] / np.sqrt(healthy.s2)
+                self._parts.append((k, rows, X, np.r_[size : size + m, :n]))
+                size += m
         precision, self._right = np.eye(size), np.zeros((size, 2))
-        precision[:n, :n] = known[:, :-1].T @ known[:, :-1]
-        self._right[:n, 1] = known[:, :-1].T @ known[:, -1]
-        self._parts, first = [], n
-        for k in used:
-            m = logs[k].m
-            X = logs[k].columns[inside[k], : m + n] / np.sqrt(healthy.s2)
-            at = np.r_[first : first + m, :n]
+        precision[:n, :n], self._right[:n, 1] = known[:-1, :-1], known[:-1, -1]
+        for _, _, X, at in self._parts:
             precision[np.ix_(at, at)] += X.T @ X
-            self._parts.append((k, inside[k], X, at))
-            first += m
         self._root = np.linalg.cholesky(precision)
 
     def about(self, evidence: Evidence, size: float) -> tuple[float, float, float, float]:
@@ -90,24 +88,20 @@ class SizeProfile:
 
         The slope has the sign of a column.
         """
-        here = there = log.simulated.plain
-        change = 1.0
+        found, change = [log.simulated.plain] * 2, 1.0
         if shape is not None:
             step = abs(shape.about) / shape.bound
             low, high = shape.low / shape.bound, shape.high / shape.bound
-            beyond = size + step if size + step <= high else size - step
-            beyond = min(max(beyond, low), high)
+            beyond = size + step if size + step <= high else max(size - step, low)
             change = beyond - size
-            here, there = (
-                log.simulated.with_effect(shape.effect, shape.values(each * shape.bound))
-                if each
-                else log.simulated.plain
-                for each in (size, beyond)
-            )
-        volts, volts_there = here.residual_v[log.kept], there.residual_v[log.kept]
-        soc, soc_there = (self._healthy.own_soc(log, each.soc_pct) for each in (here, there))
-        slope = np.column_stack([(volts - volts_there) / change, volts])
-        return slope, np.array([(soc - soc_there) / change, soc])
+            for k, each in enumerate((size, beyond)):
+                if each:
+                    values = shape.values(each * shape.bound)
+                    found[k] = log.simulated.with_effect(shape.effect, values)
+        here_v, there_v = (each.residual_v[log.kept] for each in found)
+        here, there = (self._healthy.own_soc(log, each.soc_pct) for each in found)
+        slope = np.column_stack([(here_v - there_v) / change, here_v])
+        return slope, np.array([(here - there) / change, here])
 
     def _next(
         self, evidence: Evidence, size: float, here: tuple[float, float, float, float]

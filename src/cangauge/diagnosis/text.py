@@ -82,7 +82,7 @@ def sentence(evidence: Evidence, pack: Pack, logs: Sequence[Trace]) -> str:
         "of_voltage": number(100.0 * abs(size) / pack.voltage_v, 1, "%"),
         "of_gain": number(abs(size), 1, "%"),
         "of_share": number(100.0 * abs(size), 0, "%"),
-        "end": shape.name.removeprefix("at_"),
+        "end": shape.amplitude.name.removeprefix("at_"),
         "stated_pct": start_pct,
         "true_pct": start_pct + size,
         "pct": f"({start_pct + low:.0f}–{start_pct + high:.0f} %)",
@@ -99,8 +99,8 @@ def answer(found: Diagnosis) -> str:
     """Return the answer in three lines: what, how far and where, what to do."""
     lines = [_what(found), _how_far(found), _to_do(found)]
     if found.simulator is not None:
-        if found.simulator.remark:  # it says itself what to do
-            lines = [found.simulator.remark, *(lines if found.posterior.stated else lines[:2])]
+        if found.simulator:  # it says itself what to do
+            lines = [found.simulator, *(lines if found.posterior.stated else lines[:2])]
         if found.correction is not None:
             lines.append(_simulator_change(found.correction.evidence))
     check = found.model_check
@@ -119,7 +119,10 @@ def _simulator_change(evidence: Evidence) -> str:
 
 def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     """Return what the model misses on the healthy logs, and what to do about it."""
-    error_v, name = volts(check.references_rmse_v), "simulator" if found.simulator else "model"
+    error_v, name = (
+        volts(check.references_rmse_v),
+        "model" if found.simulator is None else "simulator",
+    )
     given = found.model.extended_model().pack
     references = found.healthy.references
     missed = "; ".join(_lower(sentence(each.evidence, given, references)) for each in check.missed)
@@ -130,7 +133,7 @@ def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     lines = [f"The {name} misses the healthy logs by {error_v} ({among}): {what}."]
     if missed:
         lines.append(f"Error {error_v} → {volts(check.missed[-1].rmse_v)} with this corrected.")
-    if found.simulator:
+    if found.simulator is not None:
         return [*lines, "Correct the simulator on healthy logs first."]
     path = found.correction_path if found.is_written else None
     better = f", or take {path}" if path else ""
@@ -190,7 +193,8 @@ def _likeliest(posterior: Posterior) -> str:
 
 def _how_far(found: Diagnosis) -> str:
     """Return the error as it is, corrected, and of healthy logs; and where it lies."""
-    whose = "healthy logs of this pack have" if found.has_references else "the model file states"
+    has_references = found.healthy.references
+    whose = "healthy logs of this pack have" if has_references else "the model file states"
     error = volts(found.baseline_rmse_v)
     if found.is_corrected:
         error += f" → {volts(found.extended_rmse_v)} with {_corrected(found)}"
@@ -305,12 +309,12 @@ def caveats(found: Diagnosis) -> list[str]:
             f"{counted(number_of, 'reference')} cannot show how much healthy logs differ: give"
             f" {LEAST_REFERENCES} or more."
         )
-    if not found.has_references:
+    if not found.healthy.references:
         remarks.append("Without references the error that the model file states counts as normal.")
     for log, rows in zip(found.logs, found.rows, strict=True):
         name, steps_s = log.name, np.diff(log.time_s)
         interval_s, part = float(np.median(steps_s)), 1.0 - rows.kept.size / rows.trace.rows.size
-        if found.has_references and part > 0.05:
+        if found.healthy.references and part > 0.05:
             remarks.append(
                 f"{percent(part)} of {name} lies at SoC that no reference visits (within"
                 f" {COVER_PCT:.0f} %) and is left out."
@@ -334,7 +338,7 @@ def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:
     rows = []
     for fault, p in found.posterior.faults.items():
         best = found.best_of(fault)
-        value, half = best.shape.neutral + best.size, best.half_width
+        value, half = best.parameters[best.shape.amplitude.name].value, best.half_width
         ends = f"{significant(value - half, 2)} … {significant(value + half, 2)}"
         size = f"{significant(value, 2, shown_unit(best.shape.unit))} ({ends})"
         effect, left = best.shape.effect.id.replace("_", " "), found.corrections[fault].rmse_v
