@@ -160,7 +160,6 @@ class Figure:
 
     def mark(self, dimension: str, at: float, color: str = "#66707d", **style: Any) -> None:
         """Draw a line across the figure: at zero error, or at a moment."""
-        style = {"line_width": 1} | style
         self.plot.add_layout(
             models.Span(location=at, dimension=dimension, line_color=color, **style)
         )

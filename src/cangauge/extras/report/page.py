@@ -12,7 +12,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.resources import Resources
 from bokeh.themes import Theme
@@ -68,14 +67,6 @@ def joined(names: Sequence[str], at_most: int = 3) -> str:
     return f"{', '.join(names[: at_most - 1])} and {len(names) - at_most + 1} more"
 
 
-def _is_figure(block: Block) -> bool:
-    return isinstance(block, Figure)
-
-
-def _is_table(block: Block) -> bool:
-    return isinstance(block, Table)
-
-
 _PAGE: Final = "page.html.j2"
 _ENVIRONMENT: Final = Environment(
     loader=FileSystemLoader(_TEMPLATES),
@@ -85,7 +76,6 @@ _ENVIRONMENT: Final = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.tests |= {"figure": _is_figure, "table": _is_table}
 _ENVIRONMENT.globals |= {"Table": Table, "Tile": Tile}
 _ENVIRONMENT.filters |= {
     "duration": duration,
@@ -160,7 +150,6 @@ class Page:
         figures = self.figures
         script, drawn, bokeh_js = "", (), ""
         if figures:
-            _add_to_document([item.plot for item in figures])
             theme = Theme(filename=_TEMPLATES / "theme.yaml")
             script, drawn = components([item.plot for item in figures], theme=theme)
             # Only bokeh's core: its widgets, tables and formulae would add 2.7 MB.
@@ -195,13 +184,3 @@ class Page:
         path = self.model_path
         sha256 = text_sha256(self.model.to_json()) if path is None else file_sha256(path)
         return [("model", self.model.name, sha256), *logs]
-
-
-def _add_to_document(plots: Sequence[Any]) -> None:
-    """Add plots to one document at once: bokeh would search it again after each of them."""
-    if any(plot.document is not None for plot in plots):
-        return  # rendered before
-    document = Document()
-    with document.models.freeze():
-        for plot in plots:
-            document.add_root(plot)
