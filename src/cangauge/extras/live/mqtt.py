@@ -13,8 +13,10 @@ import logging
 import re
 import socket
 import time
+import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paho.mqtt.client import Client, MQTTMessageInfo
@@ -39,56 +41,15 @@ RETRY_S: Final = (1, 30)
 """First and longest pause between attempts to connect, doubled each time [s]."""
 LEAVE_WITHIN_S: Final = 0.5
 """Time limit for saying goodbye to the broker [s]."""
-
-
-_SENSORS: Final = {
-    "soc_pct": ("estimate.soc_pct", "State of charge", "%", "battery", 1),
-    # A class "battery" of the same unit would make two batteries of one pack.
-    "soc_std_pct": (
-        "estimate.soc_std_pct",
-        "State of charge, standard deviation",
-        "%",
-        None,
-        2,
-    ),
-    "status": ("status", "Status", None, "enum", None),
-    "current_a": ("sample.current_a", "Current", "A", "current", 1),
-    "voltage_v": ("sample.voltage_v", "Voltage", "V", "voltage", 1),
-    "residual_v": ("estimate.residual_v", "Voltage, measured less modelled", "V", "voltage", 3),
-    "temperature_c": ("sample.temperature_c", "Temperature", "°C", "temperature", 1),
-    "capacity_ah": ("health.capacity_ah", "Capacity", "Ah", None, 1),
-    "resistance_ratio": (
-        "health.resistance_ratio",
-        "Resistance relative to the model's",
-        None,
-        None,
-        2,
-    ),
-    "current_offset_a": ("health.offset_a", "Current sensor offset", "A", "current", 2),
-    "discharge_a": (
-        "power.discharge_a",
-        "Discharge current possible for 10 s",
-        "A",
-        "current",
-        0,
-    ),
-    "charge_a": ("power.charge_a", "Charge current possible for 10 s", "A", "current", 0),
-    "energy_kwh": ("power.energy_wh", "Energy left", "kWh", "energy_storage", 2),
-    "weakest_cell": ("cells.weakest", "Weakest cell", None, None, None),
-    "weakest_soc_pct": (
-        "cells.soc_pct",
-        "State of charge of the weakest cell",
-        "%",
-        None,
-        1,
-    ),
-}
-"""Sensors of Home Assistant: place of the state in a status; name, unit, class and digits."""
+_SENSORS: Final = tomllib.loads(
+    Path(__file__).with_name("sensors.toml").read_text(encoding="utf-8")
+)
+"""Sensors of Home Assistant: place of the state in a status, and settings."""
 
 
 def state(status: Mapping[str, Any]) -> dict[str, Any]:
     """Return the state to publish for a status: one flat JSON object."""
-    values = {key: value_at(status, place) for key, (place, *_) in _SENSORS.items()}
+    values = {key: value_at(status, each["place"]) for key, each in _SENSORS.items()}
     if (energy_wh := values["energy_kwh"]) is not None:
         values["energy_kwh"] = 1e-3 * energy_wh
     return values | {"reasons": status["reasons"]}
@@ -176,14 +137,12 @@ class MqttPublisher(Output):
 
     def _found(self, key: str, status: Mapping[str, Any]) -> dict[str, Any]:
         """Return Home Assistant's configuration of a sensor."""
-        _, name, unit, device_class, digits = _SENSORS[key]
         availability = [{"topic": self._availability_topic}]
         if key in {"soc_pct", "soc_std_pct"}:
             # An invalid SoC is shown as unavailable, never as a number that looks sound.
             template = "{{ 'offline' if value_json.status == 'invalid' else 'online' }}"
             availability.append({"topic": self._state_topic, "value_template": template})
         content: dict[str, Any] = {
-            "name": name,
             "unique_id": f"{self._device}_{key}",
             "state_topic": self._state_topic,
             "value_template": f"{{{{ value_json.{key} }}}}",
@@ -196,17 +155,13 @@ class MqttPublisher(Output):
                 "model": status["vehicle"],
                 "sw_version": __version__,
             },
-            "unit_of_measurement": unit,
-            "device_class": device_class,
-            "suggested_display_precision": digits,
+            **_SENSORS[key]["settings"],
         }
-        if device_class == "enum":
+        if key == "status":
             content["options"] = [each.name.lower() for each in Status]
             content["json_attributes_topic"] = self._state_topic
             content["json_attributes_template"] = "{{ {'reasons': value_json.reasons} | tojson }}"
-        elif key != "weakest_cell":
-            content["state_class"] = "measurement"
-        return {key: value for key, value in content.items() if value is not None}
+        return content
 
     def _send(self, topic: str, text: str) -> MQTTMessageInfo:
         # QoS 0: unlike the others it is never queued for a broker that is away.
