@@ -139,7 +139,6 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
         (lambda raw: raw.update(effects=[{"id": "hysteresis"}]), "effects.0"),
         (lambda raw: raw.update(surprise=1), "surprise"),
         (lambda raw: raw["information"]["root"].pop(), "information.root"),
-        (lambda raw: raw["information"]["root"].reverse(), "information.root"),
     ],
 )
 def test_names_the_invalid_field(model: Model, tmp_path: Path, break_it, field) -> None:

@@ -8,7 +8,7 @@ with one row and carries the effects' memories. Without effects both equal the v
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -64,8 +64,8 @@ class Prediction:
     """Delayed and low-passed currents at `rows` [A], shape (m, M)."""
     beside_v: FloatArray = field(repr=False)
     """Part of the voltage at `rows` that does not depend on SoC [V], shape (m,)."""
-    over_soc: list[tuple[Effect, Values, FloatArray]] = field(repr=False)
-    """Effects whose voltage depends on SoC, and their drive at `rows` [V], shape (m,)."""
+    drives: list[FloatArray] = field(repr=False)
+    """Drives of `ExtendedModel.over_soc` at `rows` [V], shape (m,) each."""
 
     @property
     def residual_v(self) -> FloatArray:
@@ -97,6 +97,19 @@ class ExtendedModel:
     def pack(self) -> Pack:
         """The pack's sizes."""
         return Pack.of(self.model, self.capacity_ah)
+
+    @cached_property
+    def over_soc(self) -> list[tuple[Effect, Values]]:
+        """The effects whose voltage depends on SoC."""
+        return [each for each in self.effects if each[0].uses_soc]
+
+    def add_over_soc(
+        self, volts: FloatArray, soc_pct: FloatArray, drives: Iterable[FloatArray]
+    ) -> FloatArray:
+        """Return voltages with those of `over_soc` at a SoC added [V], given their drives."""
+        for (effect, values), drive in zip(self.over_soc, drives, strict=True):
+            volts = volts + drive * effect.over_soc(soc_pct, values, self.model)
+        return volts
 
     def with_effect(self, effect: Effect, values: Values) -> ExtendedModel:
         """Return the model with one more effect."""
@@ -147,18 +160,18 @@ class ExtendedModel:
         volts = load_columns @ model.load_coefficients
         drop_v = load_columns[:, 1:] @ model.load_coefficients[1:]
         inputs = Inputs(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
-        over_soc = []
+        drives = []
         for effect, values in effects:
             drive = effect.drive(inputs, values, effect.context(values, model, pack))
             if drive is None:
                 continue
             if effect.uses_soc:
-                over_soc.append((effect, values, drive[at_rows]))
+                drives.append(drive[at_rows])
             else:
                 volts = volts + drive
         if is_whole:
             volts, currents = volts[at_rows], currents[at_rows]
-        prediction = Prediction(at_rows, volts, signals, soc, currents, volts, over_soc)
+        prediction = Prediction(at_rows, volts, signals, soc, currents, volts, drives)
         return replace(prediction, voltage_v=self.voltage_at(soc[at_rows], prediction))
 
     def voltage_at(self, soc_pct: FloatArray, prediction: Prediction) -> FloatArray:
@@ -170,9 +183,7 @@ class ExtendedModel:
         prediction : Prediction
         """
         volts = self.model.pseudo_ocv(soc_pct) + prediction.beside_v
-        for effect, values, drive in prediction.over_soc:
-            volts = volts + drive * effect.over_soc(soc_pct, values, self.model)
-        return np.asarray(volts)
+        return self.add_over_soc(volts, soc_pct, prediction.drives)
 
     def counting(self, initial_soc_pct: float) -> Counting:
         """Return how charge is counted from an assumed initial SoC [%]."""
@@ -189,7 +200,7 @@ def newton_soc(model: ExtendedModel, prediction: Prediction) -> FloatArray:
     at hand.
     """
     measured = prediction.signals.voltage_v[prediction.rows]
-    if not prediction.over_soc:
+    if not prediction.drives:
         return socs_from_ocv(model.model, measured - prediction.beside_v)
     low, high = np.zeros_like(measured), np.full_like(measured, 100.0)
     for _ in range(45):  # down to 3e-12 %
@@ -247,8 +258,7 @@ class OnlineModel:
         """Voltage by earlier currents, which a slow log shows in part [V/A]."""
         self.load = np.full(self.load_coefficients.size, math.nan)
         """The load row at the latest reading, shape (k,); NaN before any."""
-        self._over_soc = [each for each in extended.effects if each[0].uses_soc]
-        self.drives = np.zeros(1 + len(self._over_soc))
+        self.drives = np.zeros(1 + len(extended.over_soc))
         """The effects' drives at the latest reading, shape (1 + effects over SoC,).
 
         The first is the voltage of effects that do not depend on the SoC [V]. The effects' voltage
@@ -343,12 +353,10 @@ class OnlineModel:
         volts, slope = self.model.curve.at(soc_pct)
         drives = self.drives if drives is None else drives
         volts += float(drives[0])
-        if self._over_soc:
+        if self.extended.over_soc:
             step_pct = 0.05  # of a central difference
             at = soc_pct + step_pct * np.array([-1.0, 0.0, 1.0])
-            extra = np.zeros(3)
-            for (effect, values), drive in zip(self._over_soc, drives[1:], strict=True):
-                extra += drive * effect.over_soc(at, values, self.model)
+            extra = self.extended.add_over_soc(np.zeros(3), at, drives[1:])
             volts += float(extra[1])
             slope += float(extra[2] - extra[0]) / (2.0 * step_pct)
             slope = max(slope, self._slope_at_least)
@@ -357,9 +365,7 @@ class OnlineModel:
     def curve_values(self, soc_pct: FloatArray) -> FloatArray:
         """Return curve and effects [V] of the latest reading at SoC [%] of shape (n,)."""
         volts = self.model.curve.values(soc_pct) + float(self.drives[0])
-        for (effect, values), drive in zip(self._over_soc, self.drives[1:], strict=True):
-            volts += drive * effect.over_soc(soc_pct, values, self.model)
-        return volts
+        return self.extended.add_over_soc(volts, soc_pct, self.drives[1:])
 
     def take_over(self, before: OnlineModel) -> None:
         """Take over the currents of another model's form; low-passed ones where τ is the same."""

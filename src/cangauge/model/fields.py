@@ -18,6 +18,8 @@ def increasing(values: tuple[float, ...]) -> tuple[float, ...]:
     return values
 
 
+CURE = "create the file with `cangauge fit`"
+
 # Wider than any pack needs, narrow enough that no voltage overflows.
 Value = Annotated[float, Field(ge=-1e12, le=1e12)]
 Soc = Annotated[float, Field(ge=-10, le=110)]
@@ -43,6 +45,7 @@ class Fields(BaseModel):  # noqa: PLW1641 (frozen: pydantic gives its hash)
 def check_shape(field: str, values: Sequence[Any], number: int, *inner: int) -> None:
     """Raise InputError, with the field, if nested values have another shape."""
     if len(values) != number:
-        raise InputError(f"needs {number} values", field=field, value=len(values))
+        problem = f"needs {number} values"
+        raise InputError(problem, field=field, value=len(values), cure=CURE)
     for place, row in enumerate(values) if inner else ():
         check_shape(f"{field}.{place}", row, *inner)

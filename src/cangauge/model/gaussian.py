@@ -40,13 +40,10 @@ class GaussianPosterior:
     mean : array of shape (p,)
     root : array of shape (p, p)
         A root of the covariance: root·rootᵀ.
-    log_evidence : float
-        Log density of y with θ integrated out.
     """
 
     mean: FloatArray
     root: FloatArray
-    log_evidence: float
 
     @property
     def covariance(self) -> FloatArray:
@@ -159,13 +156,11 @@ class Rows:
         return Rows(table[columns:, columns:], log_norm)
 
     def posterior(self) -> GaussianPosterior:
-        """Return posterior and log evidence; each coefficient needs a prior, or rows."""
+        """Return the posterior; each coefficient needs a prior, or rows."""
         p = self.table.shape[1] - 1
         table = _triangular(self.table)
         root = solve_triangular(table[:p, :p], np.eye(p))
-        left = self.eliminated(p)
-        log_evidence = left.log_norm - 0.5 * float(np.sum(left.table**2))
-        return GaussianPosterior(root @ table[:p, -1], root, log_evidence)
+        return GaussianPosterior(root @ table[:p, -1], root)
 
     def added(self, columns: int, std: FloatArray) -> Added:
         """Return what each column after the first gives to the model of the first ones.

@@ -19,13 +19,14 @@ from pydantic import (
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._text import number, significant, span
-from cangauge.errors import InputError
+from cangauge.errors import InputError, located
 from cangauge.logs.log import Log, as_log
 from cangauge.model.curve import BASIS_NAMES, KNOTS_PCT, HermiteCurve, PublishedCurve
 from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
 from cangauge.model.fields import (
+    CURE,
     Celsius,
     Delays,
     Fields,
@@ -60,8 +61,6 @@ PRIOR_RANGE_C: Final = (-20.0, 50.0)
 """Temperatures that the prior's cells are specified for, in typical data sheets [°C]."""
 PRIOR_C_RATE: Final = 3.0
 """Current that they are specified for [1/h]."""
-
-_CURE: Final = "create the file with `cangauge fit`"
 
 
 class Coefficient(Fields):
@@ -214,8 +213,6 @@ class Model(Fields):
             p = len(information.columns)
             check_shape("information.root", information.root, p, p)
             check_shape("information.projected", information.projected, p)
-            if np.any(np.tril(information.root, -1)):
-                raise InputError("must be upper triangular", field="information.root")
         return self
 
     def __repr__(self) -> str:
@@ -256,7 +253,8 @@ class Model(Fields):
             curve = PublishedCurve(ocv_v, self.published.epsilon, self.range.soc_pct)
             return VoltageModel(curve, self.published.loads, self.range)
         lacking = "published" if self.equation == "published" else "curve, loads"
-        raise InputError(f"missing, though the equation is {self.equation}", field=lacking)
+        problem = f"missing, though the equation is {self.equation}"
+        raise InputError(problem, field=lacking, cure=CURE)
 
     def extended_model(self) -> ExtendedModel:
         """Return the voltage model with the effects.
@@ -341,39 +339,25 @@ class Model(Fields):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = as_path(path)
-        try:
-            data = read_bounded(path, 4 * MIB, "a model file")
-        except InputError as error:
-            if not isinstance(error.__cause__, FileNotFoundError):
-                raise
-            cure = "`cangauge fit LOG -o MODEL.json` makes one"
-            raise InputError(error.problem, source=path, cure=cure) from error
-        try:
-            raw = json.loads(data, parse_constant=_refuse_constant)
-            json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
-        head = raw if isinstance(raw, dict) else {}
-        for field, known, problem in (
-            ("format", ("cangauge-model",), "not a cangauge model"),
-            ("version", (2,), "this release reads version 2: fit again"),
-        ):
-            value = head.get(field) if head is raw else type(raw).__name__
-            if value not in known:
-                raise InputError(problem, source=path, field=field, value=value, cure=_CURE)
-        try:
-            model = cls.model_validate(raw)
+        data = read_bounded(path, 4 * MIB, "a model file")
+        with located(path):
+            try:
+                raw = json.loads(data)
+                json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
+            except (ValueError, RecursionError) as error:
+                raise InputError(f"not JSON ({error})", cure=CURE) from error
+            head = raw if isinstance(raw, dict) else {}
+            if head.get("format") != "cangauge-model":
+                value = head.get("format")
+                raise InputError("not a cangauge model", field="format", value=value, cure=CURE)
+            if head.get("version") != 2:
+                problem, value = "this release reads version 2: fit again", head.get("version")
+                raise InputError(problem, field="version", value=value, cure=CURE)
+            try:
+                model = cls.model_validate(raw)
+            except ValidationError as error:
+                raise schema_error(error, cls, path, CURE) from error
             model.extended_model()
-        except ValidationError as error:
-            raise schema_error(error, cls, path, _CURE) from error
-        except InputError as error:
-            raise InputError(
-                error.problem,
-                source=path,
-                field=error.field,
-                value=error.value,
-                cure=error.cure or _CURE,
-            ) from error
         return model
 
     def to_json(self) -> str:
@@ -469,10 +453,6 @@ class Model(Fields):
             ),
             made=Made(by=PRIOR_MADE_BY, options={}, logs=[], fingerprint="prior"),
         )
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a finite number")
 
 
 def as_model(model: Any) -> Model:

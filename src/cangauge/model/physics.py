@@ -19,31 +19,19 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
         [Ah].
     noise : Noise
     """
-    _check_curve(model)
-    _check_sizes(model, capacity_ah, noise)
-    _check_sign(model)
-
-
-def _has_knots(model: VoltageModel) -> bool:
-    return isinstance(model.curve, HermiteCurve)
-
-
-def _check_curve(model: VoltageModel) -> None:
+    has_knots = isinstance(model.curve, HermiteCurve)
+    middle_v, loads = model.nominal_v, model.loads
     ends = model.pseudo_ocv([*model.range.soc_pct]).tolist()
-    low, high = min(*ends, model.nominal_v), max(*ends, model.nominal_v)
+    low, high = min(*ends, middle_v), max(*ends, middle_v)
     # Lithium cells are used between 2.0 and 4.4 V, lead and nickel cells over a narrower range;
     # vehicles and stores stay below 1.5 kV.
     if not (low > 0.0 and high <= min(1e4, 3.0 * low)):
         raise InputError(
             f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
-            field="curve.voltage_v" if _has_knots(model) else "published.coefficients",
+            field="curve.voltage_v" if has_knots else "published.coefficients",
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-
-
-def _check_sizes(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:
-    middle_v, loads = model.nominal_v, model.loads
-    if _has_knots(model):
+    if has_knots:
         ohm_field, first, kt_field = "loads.resistance_ohm.", 0, "loads.kt_v_per_k"
     else:
         ohm_field, first, kt_field = "published.coefficients.R", 1, "published.coefficients.kt"
@@ -69,14 +57,10 @@ def _check_sizes(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:
                     value=value,
                     cure="check the value and its unit, or the capacity",
                 )
-
-
-def _check_sign(model: VoltageModel) -> None:
     # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
     # the spread of their resistances in the covariance, so that a wrong sign is within it.
-    (low_a, high_a), lasting_ohm = model.range.current_a, sum(model.loads.resistance_ohm)
-    most_v = RESISTANCE_AT_LEAST * model.nominal_v
-    if not _has_knots(model) and lasting_ohm * (high_a - low_a) > most_v:
+    (low_a, high_a), lasting_ohm = model.range.current_a, sum(loads.resistance_ohm)
+    if not has_knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle_v:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",
             field="published.coefficients",

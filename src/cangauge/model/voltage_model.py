@@ -26,6 +26,7 @@ from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.curve import Curve, cubic_at, hermite_slopes
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.fields import (
+    CURE,
     Ampere,
     Celsius,
     Delays,
@@ -190,7 +191,8 @@ class Ranges(Fields):
     def _not_empty(self) -> Self:
         for name, span in self:
             if span is not None and span[1] < span[0]:
-                raise InputError("the range is empty", field=f"range.{name}", value=span)
+                field = f"range.{name}"
+                raise InputError("the range is empty", field=field, value=span, cure=CURE)
         return self
 
 

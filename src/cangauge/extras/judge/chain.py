@@ -172,10 +172,7 @@ class Chain:
     def voltage_v(self, soc_pct: FloatArray) -> FloatArray:
         """Return the voltage of the model at a SoC of each block [V]."""
         volts = self.extended.model.pseudo_ocv(soc_pct) + self.blocks.load_v
-        over_soc = [each for each in self.extended.effects if each[0].uses_soc]
-        for (effect, values), drive in zip(over_soc, self.blocks.drives.T, strict=True):
-            volts = volts + drive * effect.over_soc(soc_pct, values, self.extended.model)
-        return np.asarray(volts)
+        return self.extended.add_over_soc(volts, soc_pct, self.blocks.drives.T)
 
     def slope(self, soc_pct: FloatArray) -> FloatArray:
         """Return the slope of the voltage over the SoC at each block, over 2 % of it [V/%]."""
@@ -284,7 +281,7 @@ def _samples(number: int, log: Log, extended: ExtendedModel, step_pct: float) ->
         base.signals.temperature_c,
         extended.model.load_columns(base.signals.temperature_c, base.currents_a),
         base.beside_v,
-        np.array([drive for *_, drive in base.over_soc]).reshape(-1, len(log)).T,
+        np.array(base.drives).reshape(-1, len(log)).T,
         np.array(sensor_pct).T,
         np.array(sensor_v).T,
         *read_published(log, drawn_pct, step_pct),
