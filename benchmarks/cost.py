@@ -268,7 +268,9 @@ def _long_logs(number: int, rows: int) -> Iterator[Log]:
         delayed = np.column_stack(
             [np.interp(time_s - d, time_s, current_a) for d in known.loads.delays_s]
         )
-        volts = known.voltage(soc_pct, temperature_c, delayed) + rng.normal(0.0, 0.5, time_s.size)
+        loads = known.load_columns(temperature_c, delayed)
+        volts = known.pseudo_ocv(soc_pct) + loads @ known.load_coefficients
+        volts += rng.normal(0.0, 0.5, time_s.size)
         yield Log(time_s, current_a, volts, temperature_c, soc_pct, name=f"log {seed}")
 
 

@@ -120,7 +120,9 @@ def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
         [np.interp(time_s - delay, time_s, current_a) for delay in voltage_model.loads.delays_s]
     )
     temperature_c = 23.0 + 2.0 * np.sin(time_s / 2000.0)
-    voltage_v = voltage_model.voltage(np.clip(soc_pct, 5.0, 98.0), temperature_c, delayed)
+    loads = voltage_model.load_columns(temperature_c, delayed)
+    voltage_v = voltage_model.pseudo_ocv(np.clip(soc_pct, 5.0, 98.0))
+    voltage_v += loads @ voltage_model.load_coefficients
     voltage_v += rng.normal(0.0, 0.5, time_s.size)
     columns = (time_s + EPOCH_S, current_a, voltage_v, temperature_c)
     return [Sample(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]

@@ -7,7 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from cangauge._typing import FloatArray
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.model.curve import Curve
@@ -46,7 +48,8 @@ def synthetic_log(
     rng = np.random.default_rng(seed + 1000)
     temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0) + 0.5 * np.sin(time_s / 130.0)
     voltage_v = (
-        model.voltage(
+        voltage_of(
+            model,
             soc_pct,
             temperature_c,
             delayed_currents(time_s, current_a, model.loads.delays_s, time_s),
@@ -55,6 +58,14 @@ def synthetic_log(
     )
     return Log(time_s, current_a, voltage_v, temperature_c, soc_pct, name=name,
                temperature_source="room")  # fmt: skip
+
+
+def voltage_of(
+    model: VoltageModel, soc_pct: ArrayLike, temperature_c: ArrayLike, currents_a: ArrayLike
+) -> FloatArray:
+    """The voltage of a model: its pseudo-OCV, and its load columns times their coefficients."""
+    columns = model.load_columns(temperature_c, np.asarray(currents_a, dtype=np.float64))
+    return model.pseudo_ocv(soc_pct) + columns @ model.load_coefficients
 
 
 RANGES = Ranges(soc_pct=(0.0, 100.0), temperature_c=(-40.0, 80.0), current_a=(-1e3, 1e3))

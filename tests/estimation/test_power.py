@@ -21,7 +21,7 @@ from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from cangauge.settings import PackLimits
 from cangauge.types import Power, Sample
-from synthetic import synthetic_log
+from synthetic import synthetic_log, voltage_of
 
 PACK = leaf_2012_model()
 LIMITS = PackLimits(
@@ -50,7 +50,7 @@ def true_voltages(row: int, current_a: float) -> np.ndarray:
     assert LOG.soc_pct is not None
     soc_pct = LOG.soc_pct[row] - 100.0 / 3600.0 / CAPACITY_AH * current_a * np.arange(11.0)
     delayed = delayed_currents(time_s, current, PACK.loads.delays_s, time_s)[-11:]
-    return PACK.voltage(soc_pct, np.full(11, LOG.temperature_c[row]), delayed)
+    return voltage_of(PACK, soc_pct, np.full(11, LOG.temperature_c[row]), delayed)
 
 
 @pytest.mark.parametrize("direction", ["discharge", "charge"])
@@ -73,7 +73,7 @@ def test_energy_left_is_the_energy_of_a_discharge() -> None:
         assert LOG.soc_pct is not None
         soc_pct = np.linspace(LOG.soc_pct[row], 0.0, 2000)
         current = np.full((soc_pct.size, 4), CAPACITY_AH / 3.0)
-        volts = PACK.voltage(soc_pct, np.full(soc_pct.size, LOG.temperature_c[row]), current)
+        volts = voltage_of(PACK, soc_pct, np.full(soc_pct.size, LOG.temperature_c[row]), current)
         last = int(np.argmax(volts < 335.0)) or volts.size
         step_ah = (soc_pct[0] - soc_pct[1]) / 100.0 * CAPACITY_AH
         true_wh = volts[:last].sum() * step_ah

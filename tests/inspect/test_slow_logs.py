@@ -14,6 +14,7 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from synthetic import voltage_of
 
 
 def slow_drive(start_pct: float, seed: int, *, step_s: float = 30.0, hours: float = 3.0) -> Log:
@@ -25,7 +26,9 @@ def slow_drive(start_pct: float, seed: int, *, step_s: float = 30.0, hours: floa
     soc_pct = start_pct - 100.0 * discharged_ah(time_s, current_a) / CAPACITY_AH
     temperature_c = 20.0 + 3.0 * np.sin(time_s / 900.0)
     delayed = delayed_currents(time_s, current_a, model.loads.delays_s, time_s)
-    voltage_v = model.voltage(soc_pct, temperature_c, delayed) + rng.normal(0.0, 0.3, time_s.size)
+    voltage_v = voltage_of(model, soc_pct, temperature_c, delayed) + rng.normal(
+        0.0, 0.3, time_s.size
+    )
     return Log(time_s, current_a, voltage_v, temperature_c, soc_pct, name="slow",
                temperature_source="pack")  # fmt: skip
 

@@ -15,7 +15,7 @@ from cangauge.model.delay_line import DelayLine, delayed_currents, filled_at
 from cangauge.model.inverse import soc_from_ocv, socs_from_ocv
 from cangauge.model.published import leaf_2012_model
 from cangauge.model.voltage_model import Arrhenius
-from synthetic import voltage_model
+from synthetic import voltage_model, voltage_of
 
 MODEL = leaf_2012_model()
 K = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
@@ -32,7 +32,9 @@ def test_is_the_published_equation(soc: float, temperature: float, current: list
     expected += K[5] * s + K[6] * math.log(s) + K[7] * math.log(1.0 - s)
     expected += -0.7428 * (temperature - 20.0)
     expected += np.dot([-0.1032, -0.01501, -0.009697, -0.004652], current)
-    assert MODEL.voltage([soc], [temperature], [current])[0] == pytest.approx(expected, abs=1e-9)
+    assert voltage_of(MODEL, [soc], [temperature], [current])[0] == pytest.approx(
+        expected, abs=1e-9
+    )
 
 
 @given(
@@ -42,7 +44,7 @@ def test_is_the_published_equation(soc: float, temperature: float, current: list
 )
 def test_scalar_and_array_forms_agree(soc: float, temperature: float, current: list[float]) -> None:
     volts, slope = MODEL.pseudo_ocv_at(soc)
-    whole = MODEL.voltage([soc], [temperature], [current])[0]
+    whole = voltage_of(MODEL, [soc], [temperature], [current])[0]
     beside = MODEL.load_columns([temperature], np.array([current]))[0] @ MODEL.load_coefficients
     assert volts + beside == pytest.approx(whole, abs=1e-9)
     assert slope == pytest.approx(MODEL.pseudo_ocv_slope([soc])[0], rel=1e-9)
@@ -141,7 +143,7 @@ def test_load_columns_are_the_equation() -> None:
     factor = math.exp(3000.0 * (1.0 / 268.15 - 1.0 / 288.15)) - 1.0
     expected = -0.02 * (celsius - 20.0) + current[0] @ [-0.06, -0.01, -0.02]
     expected += 0.9 * factor * (current[0] @ [-0.05, -0.01, -0.02])
-    found = model.voltage([37.0], [celsius], current)[0] - model.pseudo_ocv([37.0])[0]
+    found = voltage_of(model, [37.0], [celsius], current)[0] - model.pseudo_ocv([37.0])[0]
     assert found == pytest.approx(expected, abs=1e-9)
 
 

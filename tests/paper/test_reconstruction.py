@@ -17,6 +17,7 @@ from cangauge.identify.rows import FitRows, decimate, fit_rows
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.model import published
+from synthetic import voltage_of
 
 VARIANTS = ("white", "correlated")
 FILES = tuple(f"leaf2012_reconstruction_{name}.parquet" for name in (*VARIANTS, "10min"))
@@ -34,7 +35,7 @@ def rows_of(variant: str) -> FitRows:
 
 
 def error_of(rows: FitRows) -> np.ndarray:
-    truth = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.current_columns_a)
+    truth = voltage_of(MODEL, rows.soc_pct, rows.temperature_c, rows.current_columns_a)
     return np.asarray(rows.voltage_v - truth)
 
 

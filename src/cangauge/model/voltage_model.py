@@ -285,18 +285,3 @@ class VoltageModel:
     def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
         """Return pseudo-OCV at `loads.t_ref_c` [V] and its slope [V per %] at one SoC [%]."""
         return self.curve.at(soc_pct)
-
-    def voltage(
-        self, soc_pct: ArrayLike, temperature_c: ArrayLike, currents_a: ArrayLike
-    ) -> FloatArray:
-        """Return the voltage [V], shape (n,).
-
-        Parameters
-        ----------
-        soc_pct, temperature_c : array_like of shape (n,)
-            State of charge [%] and temperature [°C].
-        currents_a : array_like of shape (n, M)
-            Delayed and low-passed currents [A], positive = discharge; see `currents`.
-        """
-        columns = self.load_columns(temperature_c, np.asarray(currents_a, dtype=np.float64))
-        return np.asarray(self.pseudo_ocv(soc_pct) + columns @ self.load_coefficients)

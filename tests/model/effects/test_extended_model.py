@@ -20,7 +20,7 @@ from cangauge.model.extended import ExtendedModel
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
 from cangauge.types import Sample
-from synthetic import synthetic_log, within_c
+from synthetic import synthetic_log, voltage_of, within_c
 
 ALL = tuple((effect, middle(effect)) for effect in EFFECTS)
 
@@ -31,7 +31,7 @@ def signals_of(log: Log) -> Signals:
 
 def assert_equals_the_voltage_model(log: Log, capacity_ah: float, start_pct: float) -> None:
     rows = fit_rows(with_start(log, start_pct), capacity_ah, low_pass_s=())
-    expected = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.current_columns_a)
+    expected = voltage_of(MODEL, rows.soc_pct, rows.temperature_c, rows.current_columns_a)
     at = np.searchsorted(log.time_s, rows.time_s)
     found = ExtendedModel(MODEL, capacity_ah).predict(signals_of(log), start_pct, at)
     assert np.array_equal(found.soc_pct[at], rows.soc_pct)
