@@ -110,7 +110,7 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
         for number, step in enumerate(item.steps.tolist()):
             values = item.values(step * (np.arange(item.steps.size) == number))
             change = residual_v(BASE) - residual_v(BASE.with_effect(item.effect, values))
-            found = linear.columns[:, column] * step
+            found = linear.table[:, column - count] * step
             assert found == pytest.approx(change, abs=1e-6 + 1e-6 * np.abs(change).max())
             column += 1
     assert column == count
@@ -141,7 +141,7 @@ def test_a_resistance_acts_through_the_effects_that_scale_its_drop() -> None:
 
     now_ohm = CELLS.loads.resistance_ohm[0]
     by_ohm = (voltage_v(now_ohm + step_ohm) - voltage_v(now_ohm)) / step_ohm
-    found = linearize(model(now_ohm), rows, Selected((item,)), about).features[:, N + 1]
+    found = linearize(model(now_ohm), rows, Selected((item,)), about).table[:, N + 1]
     assert found == pytest.approx(by_ohm, abs=1e-6 * np.abs(by_ohm).max())
     assert not np.allclose(found, rows.current_a, rtol=0.01)
 

@@ -16,7 +16,7 @@ from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.curve import KNOTS_PCT, hermite_basis
 from cangauge.model.model_file import Model
-from synthetic import synthetic_log
+from synthetic import synthetic_log, voltage_of
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def test_round_trip(model: Model, tmp_path: Path) -> None:
     assert again == model
     soc, currents = np.array([3.0, 50.0, 99.0]), np.full((3, 6), 20.0)
     assert np.array_equal(
-        again.voltage_model().voltage(soc, [5.0, 20.0, 30.0], currents),
-        model.voltage_model().voltage(soc, [5.0, 20.0, 30.0], currents),
+        voltage_of(again.voltage_model(), soc, [5.0, 20.0, 30.0], currents),
+        voltage_of(model.voltage_model(), soc, [5.0, 20.0, 30.0], currents),
     )
 
 
@@ -106,7 +106,7 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
     found = model.predict(replace(log, soc_pct=soc_pct))
     assert found.soc_pct[1000] == log.soc_pct[1000]
     unknown = replace(log, soc_pct=None)
-    with pytest.raises(InputError, match="unknown initial SoC"):
+    with pytest.raises(InputError, match=r"the SoC at the start is unknown.*give initial_soc_pct"):
         model.predict(unknown)
     assert model.predict(unknown, initial_soc_pct=90.0).soc_pct[0] == 90.0
 

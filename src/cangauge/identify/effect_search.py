@@ -12,7 +12,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,8 @@ from cangauge.identify.least_squares import (
     solve,
     solve_without,
 )
-from cangauge.identify.rows import FitRows, dequantize, start_of
+from cangauge.identify.rows import FitRows, dequantize
+from cangauge.model.coulomb_counting import start_of
 from cangauge.model.effects.base import Effect, Inputs, Signals, Values
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction
@@ -193,37 +194,15 @@ class Selected:
         return tuple((item.effect, item.values(part)) for item, part in parts)
 
 
-@dataclass(frozen=True, eq=False)
-class Linearized:
-    """A model with effects on the rows of one log, to first order.
-
-    Parameters
-    ----------
-    rows : FitRows
-        With the SoC that the effects give.
-    features : array of shape (m, BASE)
-        dU/d of knots, kt, resistances and their Arrhenius parts.
-    columns : array of shape (m, e)
-        dU/d(amplitude).
-    residual_v : array of shape (m,)
-    """
+class Linearized(NamedTuple):
+    """A model with effects on the rows of one log, to first order."""
 
     rows: FitRows
-    features: FloatArray
-    columns: FloatArray
+    """With the SoC that the effects give."""
+    table: FloatArray
+    """dU/d of knots, kt, resistances, their Arrhenius parts and amplitudes, shape (m, BASE + e)."""
     residual_v: FloatArray
-
-    @property
-    def table(self) -> FloatArray:
-        """All columns, shape (m, BASE + e)."""
-        return np.column_stack([self.features, self.columns])
-
-    def explained_v(self, coefficients: FloatArray, amplitudes: FloatArray) -> FloatArray:
-        """Return what the columns are to explain [V], shape (m,): the linear part and the residual.
-
-        `coefficients` of shape (BASE,) and `amplitudes` of shape (e,) are those of the model.
-        """
-        return self.features @ coefficients + self.columns @ amplitudes + self.residual_v
+    """Shape (m,)."""
 
 
 def linearize(
@@ -261,7 +240,7 @@ def linearize(
         return effect.added_v(inputs._replace(drop_v=drop_v), rows.at, soc_pct, values, model)
 
     features_at = features(soc_pct, true.temperature_c[rows.at], plain.currents_a)
-    columns, residual_v = [np.empty((len(rows), 0))], plain.residual_v
+    columns, residual_v = [features_at], plain.residual_v
     for item, amounts in selected.with_parts(amplitudes):
         effect = item.effect
         if effect.scales_drop and amounts.any():
@@ -280,8 +259,7 @@ def linearize(
                 changed = predict((*others, (effect, item.values(amounts + one))))
                 change_v = plain.residual_v - changed.residual_v
             columns.append(change_v / step)
-    table = np.column_stack(columns)
-    return Linearized(replace(rows, soc_pct=soc_pct), features_at, table, residual_v)
+    return Linearized(replace(rows, soc_pct=soc_pct), np.column_stack(columns), residual_v)
 
 
 def offered(effect_ids: Sequence[str], model: ExtendedModel) -> list[EffectCandidate]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, Literal, get_args
@@ -25,11 +24,14 @@ from cangauge.identify.identification import (
 from cangauge.identify.knots import fit_knots
 from cangauge.identify.published import PublishedEquation, fit_published
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
-from cangauge.identify.starts import find_starts, given_starts
+from cangauge.identify.starts import find_starts, given_starts, with_start
 from cangauge.logs.charge import refuse_contradictions
-from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, as_log
-from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.coulomb_counting import (
+    capacity_from_full_discharge,
+    capacity_from_reference,
+    counted_soc_pct,
+)
 from cangauge.model.curve import KNOTS_PCT
 from cangauge.model.model_file import Made, SourceLog
 from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
@@ -166,18 +168,11 @@ def _check_logs(logs: Sequence[Log]) -> None:
         raise InputError("no log given", cure="give at least one recorded log")
     by_rows: dict[str, Log] = {}
     for log in logs:
-        source = log.source or log.name
-        if len(log) < 2:
-            raise InputError(
-                "a single row cannot identify a model",
-                source=source,
-                cure="give a log of minutes or hours",
-            )
         first = by_rows.setdefault(log_sha256(log, ROWS_CHANNELS), log)
         if first is not log:
             raise InputError(
                 f"same rows as {first.source or first.name}: they would count twice",
-                source=source,
+                source=log.source or log.name,
                 cure="give each log once",
             )
     if len(sources := sorted({log.temperature_source for log in logs})) > 1:
@@ -245,9 +240,10 @@ def _fields(
     logs: Sequence[Log], rows: Sequence[FitRows], cells: int | None, options: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the fields of a model file that are known before the fit."""
+    name = logs[0].name
     used = [SourceLog(name=item.name, rows=len(item), sha256=log_sha256(item.log)) for item in rows]
     return {
-        "name": common_name([log.name for log in logs]),
+        "name": name if len(logs) == 1 else f"{name} and {len(logs) - 1} more",
         "chemistry": options["chemistry"],
         "cells": cells,
         "capacity_ah": options["capacity_ah"],
@@ -316,11 +312,11 @@ def _mean_point(
     total_v = sum(float(log.voltage_v.sum()) for log in logs)
     total_pct = 0.0
     for log, given_pct in zip(logs, starts_pct, strict=True):
-        out_pct = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
-        row, start_pct = log.first_soc() or (0, 50.0 + float(out_pct.mean()))
-        if given_pct is not None:
-            row, start_pct = 0, given_pct
-        total_pct += float(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0).sum())
+        known = log if given_pct is None else with_start(log, given_pct)
+        soc_pct = np.full(len(log), 50.0)
+        if known.first_soc() is not None:
+            soc_pct = np.clip(counted_soc_pct(known, capacity_ah), 0.0, 100.0)
+        total_pct += float(soc_pct.sum())
     return total_v / rows, total_pct / rows
 
 
@@ -331,12 +327,7 @@ def ranges_of(rows: Sequence[FitRows]) -> Ranges:
         ends = [(values.min(), values.max()) for values in (getattr(each, name) for each in rows)]
         return float(min(low for low, _ in ends)), float(max(high for _, high in ends))
 
-    return Ranges(
-        soc_pct=span("soc_pct"),
-        temperature_c=span("temperature_c"),
-        current_a=span("current_a"),
-        voltage_v=span("voltage_v"),
-    )
+    return Ranges(**{name: span(name) for name in Ranges.model_fields})
 
 
 ROWS_CHANNELS: Final = ("current_a", "voltage_v")
@@ -351,22 +342,3 @@ def log_sha256(
     for name in channels:
         digest.update(np.ascontiguousarray(getattr(log, name)).data)
     return digest.hexdigest()
-
-
-def common_name(names: Sequence[str]) -> str:
-    """Return a name for several logs: their common prefix and their number.
-
-    Examples
-    --------
-    >>> common_name(["TripA01", "TripA03", "TripA05"])
-    'TripA (3 logs)'
-    """
-    if len(names) == 1:
-        return names[0]
-    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of strings, not of paths
-    if any(name[len(prefix) : len(prefix) + 1].isdigit() for name in names):
-        prefix = prefix.rstrip("0123456789")  # of a number that differs
-    prefix = prefix.rstrip(" _-.,(")
-    if not prefix:
-        return f"{names[0]} and {len(names) - 1} more"
-    return f"{prefix} ({len(names)} logs)"

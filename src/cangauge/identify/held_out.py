@@ -20,14 +20,12 @@ def comparable(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple
     errors_v : sequence of array of shape (m,)
         Error of each log by the model of the others [V]; empty for too few logs.
     """
-    lows = [float(item.soc_pct.min()) for item in rows]
-    highs = [float(item.soc_pct.max()) for item in rows]
+    ends = np.array([(item.soc_pct.min(), item.soc_pct.max()) for item in rows])
     found = []
     for number, error_v in enumerate(errors_v):
-        low = min(lows[:number] + lows[number + 1 :])
-        high = max(highs[:number] + highs[number + 1 :])
+        lows, highs = np.delete(ends, number, axis=0).T
         soc = rows[number].soc_pct
-        found.append(np.where((soc >= low) & (soc <= high), error_v, np.nan))
+        found.append(np.where((soc >= lows.min()) & (soc <= highs.max()), error_v, np.nan))
     return tuple(found)
 
 

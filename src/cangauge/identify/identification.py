@@ -20,7 +20,6 @@ from cangauge.identify.rows import (
     SOC_SPAN_AT_LEAST_PCT,
     TEMPERATURE_SPAN_K,
     FitRows,
-    start_of,
     usable_delays,
 )
 from cangauge.identify.starts import Start
@@ -32,7 +31,7 @@ from cangauge.logs.gaps import (
     usual_step_s,
 )
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import difference_from_reference
+from cangauge.model.coulomb_counting import difference_from_reference, start_of
 from cangauge.model.effects.base import Signals
 from cangauge.model.extended import ExtendedModel, newton_soc
 from cangauge.model.inverse import socs_from_ocv
@@ -70,7 +69,7 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
     slope_ohm : float
         Slope resistance [Ω], positive.
     """
-    driven = regenerated = square = 0.0
+    sums = np.zeros(3)
     for log in logs:
         for first in range(0, len(log) - 1, CHUNK):
             part = slice(first, first + CHUNK + 1)  # with the first row of the next one
@@ -78,9 +77,9 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
             step_s[step_s > BRIDGE_S] = 0.0
             current_a = log.current_a[part]
             power_w = log.voltage_v[part] * current_a
-            driven += _integral(np.maximum(power_w, 0.0), step_s)
-            regenerated += _integral(np.maximum(-power_w, 0.0), step_s)
-            square += _integral(current_a**2, step_s)
+            rates = np.stack([np.maximum(power_w, 0.0), np.maximum(-power_w, 0.0), current_a**2])
+            sums += np.sum((rates[:, 1:] + rates[:, :-1]) * step_s, axis=1) / 2.0
+    driven, regenerated, square = sums.tolist()
     net, heat = driven - regenerated, slope_ohm * square
     joule_per_kwh = 3.6e6
     return Energy(
@@ -90,10 +89,6 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
         heat_kwh=heat / joule_per_kwh,
         efficiency_pct=100.0 * net / (net + heat) if net > 0.0 else float("nan"),
     )
-
-
-def _integral(values: FloatArray, step_s: FloatArray) -> float:
-    return float(np.sum((values[1:] + values[:-1]) * step_s) / 2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,26 +257,26 @@ class Identification:
         """Whether the error that the model states is of logs left out in turn."""
         return any(np.isfinite(error_v).any() for error_v in self.held_out_error_v)
 
-    def _mean(self, of_logs: Iterable[FloatArray]) -> float:
-        """Return the mean over the rows of all logs, of values on the rows of each."""
-        total = sum(float(np.sum(values)) for values in of_logs)
-        return total / sum(len(item.rows) for item in self.fits)
+    def _mean(self, of_logs: Iterable[float]) -> float:
+        """Return the mean over the rows of all logs, given that of each."""
+        rows = [len(item.rows) for item in self.fits]
+        return float(np.average(list(of_logs), weights=rows))
 
     @property
     def voltage_mae_pct(self) -> float:
         """Mean absolute voltage error on the rows of the fit [%]."""
-        errors = (np.abs(item.residual_v) / item.rows.voltage_v for item in self.fits)
-        return 100.0 * self._mean(errors)
+        return self._mean(item.voltage_mae_pct for item in self.fits)
 
     @property
     def voltage_rmse_v(self) -> float:
         """Root mean square of it [V]."""
-        return float(self._mean(item.residual_v**2 for item in self.fits) ** 0.5)
+        squares = (float(np.mean(item.residual_v**2)) for item in self.fits)
+        return float(self._mean(squares) ** 0.5)
 
     @property
     def soc_newton_mae_pct(self) -> float:
         """Mean absolute error of the SoC from voltage on the rows of the fit [%]."""
-        return self._mean(np.abs(f.soc_newton_pct - f.rows.soc_pct) for f in self.fits)
+        return self._mean(item.soc_newton_mae_pct for item in self.fits)
 
     def summary(self) -> dict[str, str]:
         """Return what the fit is good for, by name: the table of `cangauge fit`."""

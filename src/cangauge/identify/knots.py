@@ -110,11 +110,14 @@ def _with_effects(
     amplitudes = np.zeros(std.size)
     for _ in range(RELINEARIZED):
         about = [linearize(extended, item, selected, amplitudes) for item in rows]
-        volts = [item.explained_v(solution.of_columns[:BASE], amplitudes) for item in about]
-        tables = [item.table for item in about]
+        base = solution.of_columns[:BASE]
+        volts = [  # what is to be explained
+            item.table[:, :BASE] @ base + item.table[:, BASE:] @ amplitudes + item.residual_v
+            for item in about
+        ]
         sums = [
-            log_sums(item.rows, pack.chemistry, table, volts_of_log)
-            for item, table, volts_of_log in zip(about, tables, volts, strict=True)
+            log_sums(item.rows, pack.chemistry, item.table, volts_of_log)
+            for item, volts_of_log in zip(about, volts, strict=True)
         ]
         solution, without = solve_scaled(sums, pack, std)
         solution = selected.clipped(solution)
@@ -123,8 +126,8 @@ def _with_effects(
         voltage = knots_model(solution, fields).voltage_model()
         extended = ExtendedModel(voltage, pack.capacity_ah, effects)
     errors_v = [
-        volts_of_log - table @ other.of_columns
-        for volts_of_log, table, other in zip(volts, tables, without, strict=False)
+        volts_of_log - item.table @ other.of_columns
+        for volts_of_log, item, other in zip(volts, about, without, strict=False)
     ]
     return solution, effects, comparable([item.rows for item in about], errors_v)
 

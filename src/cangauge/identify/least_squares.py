@@ -256,9 +256,15 @@ def solve(
     for _ in range(2):  # the column of b needs the resistances: twice
         arrhenius_ohm = ohm
         select = _selection(arrhenius_ohm, float(resistance_factor(mean_c)), amplitude_std.size)
-        normal = _normal_equations(moments, w, select, theta0)
         delta, precision, residual_v2 = _with_own_noise(
-            normal, Lambda, level_std, prior.residual_v**2, (ADDED_STD * mean_v) ** 2
+            moments,
+            w,
+            select,
+            theta0,
+            Lambda=Lambda,
+            level_std=level_std,
+            variance_v2=prior.residual_v**2,
+            added_v2=(ADDED_STD * mean_v) ** 2,
         )
         theta = theta0 + delta
         fitted_ohm = theta[N + 1 : N + 1 + M]
@@ -270,35 +276,29 @@ def solve(
     return Solution(theta, covariance, arrhenius_ohm, residual_v, mean_v, mean_c, select=select)
 
 
-_Normal = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float]
-"""A, r, and of each log al, rl and wl, in the symbols of `solve`; and (u − X·θ₀)ᵀW(u − X·θ₀)."""
-
-
-def _normal_equations(
-    moments: FloatArray, w: FloatArray, select: FloatArray, theta0: FloatArray
-) -> _Normal:
-    """Return the normal equations about θ₀ from the moments and weights of each log."""
-    total = moments.sum(axis=0)
-    A = select @ total[:-2, :-2] @ select.T
-    XWu = select @ total[:-2, -1]
-    r = XWu - A @ theta0
-    a = moments[:, :-2, -2] @ select.T
-    r_log = moments[:, -2, -1] - a @ theta0
-    return A, r, a, r_log, w, float(total[-1, -1] - theta0 @ (XWu + r))
-
-
 def _with_own_noise(
-    normal: _Normal,
+    moments: FloatArray,
+    w: FloatArray,
+    select: FloatArray,
+    theta0: FloatArray,
+    *,
     Lambda: FloatArray,
     level_std: FloatArray,
     variance_v2: float,
     added_v2: float,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Solve the equations with the noise that their own residuals have: a fixed point.
+    """Solve the normal equations with the noise that their own residuals have: a fixed point.
+
+    The symbols are those of `solve`.
 
     Parameters
     ----------
-    normal : tuple
+    moments : array of shape (logs, q, q)
+    w : array of shape (logs,)
+        Weights wl.
+    select : array of shape (p, q − 2)
+        See `Solution`.
+    theta0 : array of shape (p,)
     Lambda : array of shape (p, p)
     level_std : array of shape (logs,)
         σl [V].
@@ -314,7 +314,13 @@ def _with_own_noise(
     residual_v2 : float
         Mean square residual [V²].
     """
-    A, r, a, r_log, w, square_v2 = normal
+    total = moments.sum(axis=0)
+    A = select @ total[:-2, :-2] @ select.T
+    XWu = select @ total[:-2, -1]
+    r = XWu - A @ theta0
+    a = moments[:, :-2, -2] @ select.T
+    r_log = moments[:, -2, -1] - a @ theta0
+    square_v2 = float(total[-1, -1] - theta0 @ (XWu + r))  # (u − X·θ₀)ᵀW(u − X·θ₀)
     for _ in range(12):  # fewer where it has converged
         v = variance_v2 * SECONDS_PER_DATUM
         s = 1.0 / (w + v / level_std**2)

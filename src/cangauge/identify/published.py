@@ -20,7 +20,7 @@ from cangauge.identify.held_out import comparable, stated_error
 from cangauge.identify.least_squares import LOGS_AT_LEAST, SECONDS_PER_DATUM
 from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
 from cangauge.model.curve import BASIS_NAMES, KNOTS_PCT, PublishedCurve, extended_basis, ocv_basis
-from cangauge.model.model_file import Model, Published
+from cangauge.model.model_file import Coefficient, Model, Published, coefficient_names
 from cangauge.model.noise import Noise
 from cangauge.model.prior import principal_functions
 from cangauge.model.voltage_model import DELAYS_S, REFERENCE_C
@@ -144,12 +144,21 @@ class PublishedFit:
 
     def fields(self) -> Published:
         """Return the equation for a model file."""
-        return Published.of(
-            self.coefficients.tolist(),
-            np.sqrt(np.diag(self.covariance)).tolist(),
-            epsilon=self.equation.epsilon,
-            t_ref_c=self.equation.t_ref_c,
-            delays_s=self.equation.delay_s,
+        equation, std = self.equation, np.sqrt(np.diag(self.covariance)).tolist()
+        names = coefficient_names(equation.delay_s)
+        coefficients = {
+            name: Coefficient(
+                value=value,
+                std_error=error,
+                unit="V/K" if name == "kt" else "ohm" if name.startswith("R") else "V",
+            )
+            for name, value, error in zip(names, self.coefficients.tolist(), std, strict=True)
+        }
+        return Published(
+            coefficients=coefficients,
+            epsilon=equation.epsilon,
+            t_ref_c=equation.t_ref_c,
+            delays_s=tuple(equation.delay_s),
         )
 
     def jacobian(self) -> FloatArray:

@@ -211,14 +211,6 @@ def fit_rows(
     )
 
 
-def start_of(log: Log) -> tuple[int, float]:
-    """Return index and value [%] of a log's first known SoC; ValueError without one."""
-    start = log.first_soc()
-    if start is None:
-        raise ValueError("a log of a fit has a start")
-    return start
-
-
 def decimate(time_s: FloatArray, rate_hz: float) -> NDArray[np.intp]:
     """Return the index of the first sample at or after each tick of `rate_hz`."""
     tick = np.floor((time_s - time_s[0]) * rate_hz + 1e-6)

@@ -47,6 +47,19 @@ def soc_at_first_row(log: Log, capacity_ah: float) -> float | None:
     return None if log.first_soc() is None else float(counted_soc_pct(log, capacity_ah)[0])
 
 
+def start_of(log: Log) -> tuple[int, float]:
+    """Return index and value [%] of a log's first finite SoC; raise InputError without one."""
+    start = log.first_soc()
+    if start is None:
+        raise InputError(
+            "the SoC at the start is unknown: the log states none",
+            source=log.source or log.name,
+            field="soc_pct",
+            cure="give --initial-soc P, the SoC at the first row (100 for a log from full)",
+        )
+    return start
+
+
 def counted_soc_pct(log: Log, capacity_ah: float) -> FloatArray:
     """Return the SoC counted from the first finite value of the log's own [%], shape (n,).
 
@@ -61,15 +74,7 @@ def counted_soc_pct(log: Log, capacity_ah: float) -> FloatArray:
     InputError
         If the log states no SoC.
     """
-    start = log.first_soc()
-    if start is None:
-        raise InputError(
-            "the SoC at the start is unknown: the log states none",
-            source=log.source or log.name,
-            field="soc_pct",
-            cure="give --initial-soc P, the SoC at the first row (100 for a log from full)",
-        )
-    row, start_pct = start
+    row, start_pct = start_of(log)
     out_ah = discharged_ah(log.time_s, log.current_a)
     return np.asarray(start_pct - 100.0 * (out_ah - out_ah[row]) / capacity_ah)
 

@@ -171,8 +171,9 @@ class ExtendedModel:
                 volts = volts + drive
         if is_whole:
             volts, currents = volts[at_rows], currents[at_rows]
-        prediction = Prediction(at_rows, volts, signals, soc, currents, volts, drives)
-        return replace(prediction, voltage_v=self.voltage_at(soc[at_rows], prediction))
+        ocv_v = model.pseudo_ocv(soc[at_rows])
+        voltage_v = self.add_over_soc(ocv_v + volts, soc[at_rows], drives)
+        return Prediction(at_rows, voltage_v, signals, soc, currents, volts, drives)
 
     def voltage_at(self, soc_pct: FloatArray, prediction: Prediction) -> FloatArray:
         """Return the voltages at the rows of a prediction if the SoC were another [V].
@@ -250,7 +251,6 @@ class OnlineModel:
         self._contexts = [
             effect.context(values, self.model, extended.pack) for effect, values in extended.effects
         ]
-        self._corrects = any(effect.corrects for effect, _ in extended.effects)
         self.load_coefficients = self.model.load_coefficients
         """Coefficients of the load columns, shape (k,)."""
         currents = len(self.model.loads.delays_s) + len(self.model.loads.low_pass_s)
@@ -282,11 +282,11 @@ class OnlineModel:
 
     def counted(self, current_a: float) -> float:
         """Return the counted part of a corrected current [A]."""
-        return self._counting.counted_at(current_a)
+        return float(self._counting.counted(np.array(current_a)))
 
     def correct(self, sample: Sample) -> Sequence[Sample]:
         """Return the corrected samples that are ready, usually one, in order."""
-        if not self._corrects:
+        if not self.extended.effects:
             return (sample,)
         signals = Signals(*(np.array([value]) for value in sample))
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):

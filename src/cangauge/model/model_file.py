@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -19,8 +19,9 @@ from pydantic import (
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._text import number, significant, span
-from cangauge.errors import InputError, located
+from cangauge.errors import InputError, located, naming_arguments
 from cangauge.logs.log import Log, as_log
+from cangauge.model.coulomb_counting import start_of
 from cangauge.model.curve import BASIS_NAMES, KNOTS_PCT, HermiteCurve, PublishedCurve
 from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
@@ -79,36 +80,10 @@ class Published(Fields):
     t_ref_c: Celsius
     delays_s: Delays
 
-    @classmethod
-    def of(
-        cls,
-        values: Iterable[float],
-        std: Iterable[float],
-        *,
-        epsilon: float,
-        t_ref_c: float,
-        delays_s: Sequence[float],
-    ) -> Self:
-        """Return the equation of the values k0 … k7, kt, R1 … Rn and their standard errors."""
-        coefficients = {
-            name: Coefficient(
-                value=value,
-                std_error=error,
-                unit="V/K" if name == "kt" else "ohm" if name.startswith("R") else "V",
-            )
-            for name, value, error in zip(_names(delays_s), values, std, strict=True)
-        }
-        return cls(
-            coefficients=coefficients,
-            epsilon=epsilon,
-            t_ref_c=t_ref_c,
-            delays_s=tuple(delays_s),
-        )
-
     @property
     def values(self) -> list[float]:
         """The coefficients k0 … k7, kt, R1 … Rn."""
-        return [self.coefficients[name].value for name in _names(self.delays_s)]
+        return [self.coefficients[name].value for name in coefficient_names(self.delays_s)]
 
     @property
     def loads(self) -> Loads:
@@ -125,14 +100,15 @@ class Published(Fields):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        wanted, given = set(_names(self.delays_s)), set(self.coefficients)
+        wanted, given = set(coefficient_names(self.delays_s)), set(self.coefficients)
         for word, names in (("missing", wanted - given), ("unknown", given - wanted)):
             if names:
                 raise ValueError(f"coefficients: {word} are {', '.join(sorted(names))}")
         return self
 
 
-def _names(delays_s: Sequence[float]) -> list[str]:
+def coefficient_names(delays_s: Sequence[float]) -> list[str]:
+    """Return the names of the published coefficients for some delays [s]."""
     return [*BASIS_NAMES, "kt", *(f"R{k}" for k, _ in enumerate(delays_s, start=1))]
 
 
@@ -294,6 +270,7 @@ class Model(Fields):
         noise = self.noise.model_copy(update={"level_std_v": level_v})
         return OnlineModel(extended, self.functions, noise, capacity_ah, gap_s)
 
+    @naming_arguments
     def predict(
         self, log: Log | Path | str | Any, *, initial_soc_pct: float | None = None
     ) -> Prediction:
@@ -317,15 +294,7 @@ class Model(Fields):
             If the initial SoC is unknown.
         """
         log = as_log(log)
-        start = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
-        if start is None:
-            raise InputError(
-                "unknown initial SoC",
-                source=log.source or log.name,
-                field="initial_soc_pct",
-                cure="give initial_soc_pct, or a log with soc_pct",
-            )
-        row, soc_pct = start
+        row, soc_pct = start_of(log) if initial_soc_pct is None else (0, initial_soc_pct)
         rows = np.arange(len(log))
         return self.extended_model().predict(Signals.of(log), soc_pct, rows, initial_row=row)
 

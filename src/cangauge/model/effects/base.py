@@ -185,11 +185,6 @@ class Inputs(NamedTuple):
     drop_v: FloatArray
     """Voltage of the model's resistances [V]; negative while discharging."""
 
-    def scaled_drop_v(self, delayed: float, pack: Pack) -> FloatArray:
-        """Return the drop that an effect scales [V], shape (n,); see `DELAYED`."""
-        now_v = -pack.resistance_ohm * self.current_a
-        return np.asarray(delayed * self.drop_v + (1.0 - delayed) * now_v)
-
 
 @dataclass(frozen=True)
 class Counting:
@@ -203,10 +198,6 @@ class Counting:
     def counted(self, current_a: FloatArray) -> FloatArray:
         """Return I⁺ + η·I⁻ [A], shape (n,)."""
         return np.where(current_a < 0.0, self.charge_efficiency * current_a, current_a)
-
-    def counted_at(self, current_a: float) -> float:
-        """Return I⁺ + η·I⁻ of one sample [A]."""
-        return self.charge_efficiency * current_a if current_a < 0.0 else current_a
 
 
 class CoreForm(NamedTuple):
@@ -327,11 +318,6 @@ class Effect:
     def context(self, values: Values, model: VoltageModel, pack: Pack) -> Context:
         """Return what it works with on a model, before the first sample."""
         return Context(model, pack, self.memory(values, pack))
-
-    @property
-    def corrects(self) -> bool:
-        """Whether it changes the measured signals."""
-        return self.correct is not same_signals
 
     @property
     def adds_voltage(self) -> bool:

@@ -48,8 +48,9 @@ def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
 
 
 def drop(inputs: Inputs, values: Values, at: Context) -> FloatArray:
-    """Return the drop over the resistance."""
-    return inputs.scaled_drop_v(values["delayed"], at.pack)
+    """Return the drop over the resistance, the whole or the present current's (`DELAYED`)."""
+    delayed, now_v = values["delayed"], -at.pack.resistance_ohm * inputs.current_a
+    return np.asarray(delayed * inputs.drop_v + (1.0 - delayed) * now_v)
 
 
 def grown_drop(inputs: Inputs, values: Values, at: Context) -> FloatArray:
