@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from days import (
 from cangauge.diagnosis import FAULTS as NINE
 from cangauge.diagnosis import Diagnosis, Healthy, Posterior, diagnose
 from cangauge.diagnosis.model_check import ModelCheck
+from cangauge.diagnosis.shapes import shapes
 from cangauge.diagnosis.text import plan_text, sentence
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
@@ -531,3 +533,10 @@ def test_a_single_wrong_row_is_no_fault(known: Healthy, model: Model) -> None:
     volts = log.voltage_v.copy()
     volts[500] = 700.0
     assert diagnose([replace(log, voltage_v=volts)], model, known).posterior.level != "gap"
+
+
+def test_every_effect_of_the_library_is_tried(model: Model) -> None:
+    """Those with a grid at each of its values."""
+    tried = Counter(shape.effect.id for shape in shapes(model.extended_model().pack))
+    assert set(tried) == set(LIBRARY)
+    assert tried["resistance_temperature"] == 3

@@ -38,7 +38,8 @@ def follow(
             cells.update(estimator.pack_tick(sample), volts, [0.0] * len(volts))
         if number % 60 == 59:
             found.append(cells.report)
-    return found, cells.soc_pct
+    distances_pct = np.where(cells._is_seen, cells._x[:, 0], np.nan)
+    return found, estimator.estimate.soc_pct + distances_pct
 
 
 def simulated_pack(

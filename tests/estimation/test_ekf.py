@@ -221,9 +221,9 @@ def test_an_unknown_temperature_and_one_outside_the_fit_widen_what_lasts() -> No
 
 def test_doubt_keeps_the_odds_of_an_open_question() -> None:
     hypotheses = Hypotheses(LinearModel(), 60.0, 1.0)
-    hypotheses.doubt(0.2, 10.0, 3600.0, 0.1)
+    hypotheses.doubt(10.0, 3600.0, 0.1)
     p = 1.0 / (1.0 + np.exp(-hypotheses.log_odds))
-    assert p == pytest.approx(1.0 - 0.8 * (1.0 - WRONG_PRIOR))
+    assert p == pytest.approx(1.0 - (1.0 - WRONG_PRIOR) ** 2)
     narrow, wide = hypotheses.filters
     assert narrow.P[0, 0] == pytest.approx(1.0 + 0.01)
     assert wide.P[0, 0] == pytest.approx(WRONG_STD_PCT**2 + 100.0)

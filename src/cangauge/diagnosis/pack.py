@@ -294,11 +294,8 @@ def _prior_rows(
     p, q = mean.size, _healthy_shapes(tried).size
     scale = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-9 * np.eye(p))
-    whitened = np.linalg.solve(root, np.diag(1.0 / scale))
-    table = np.zeros((p + q, p + q + 1))
-    table[:p, :p], table[:p, -1] = whitened, whitened @ mean
-    table[p:, p : p + q] = np.eye(q) / structure
-    return Rows(table, 0.0)
+    rows = Rows.correlated(np.eye(p, p + q), mean, scale[:, None] * root)
+    return Rows(np.concatenate([rows.table, np.eye(q, p + q + 1, p) / structure]), 0.0)
 
 
 def corrected_by(references: Sequence[Trace], given: Model) -> tuple[Healthy, list[LogRows]]:

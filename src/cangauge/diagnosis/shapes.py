@@ -92,7 +92,7 @@ def shapes(pack: Pack) -> tuple[Shape, ...]:
     """Return every shape of every effect, a step of resistance at each place of a log last."""
     found = []
     for item in candidates(tuple(LIBRARY.values()), pack):
-        grids = {each.name: each.grid for each in item.effect.shapes}
+        grids = {each.name: each.trials(pack) for each in item.effect.shapes}
         # A switch refines a shape that has a grid; its first value is tried.
         if len(grids) == 1 or all(
             item.shape.get(name, grid[0]) == grid[0]

@@ -140,18 +140,20 @@ class CellEstimator:
     @property
     def report(self) -> CellReport:
         """Weakest cell, spread and check of the sum."""
-        known = int(self._is_seen.sum())
         error_v, std_v, is_wrong = self._sum()
-        if not known or self._last is None or math.isnan(self._last.soc_pct):
-            return UNKNOWN._replace(
-                cells=known, sum_error_v=error_v, sum_std_v=std_v, is_sum_wrong=is_wrong
-            )
+        found = UNKNOWN._replace(
+            cells=int(self._is_seen.sum()),
+            sum_error_v=error_v,
+            sum_std_v=std_v,
+            is_sum_wrong=is_wrong,
+        )
+        if not found.cells or self._last is None or math.isnan(self._last.soc_pct):
+            return found
         distances = np.where(self._is_seen, self._x[:, 0], np.nan)
         weakest = int(np.nanargmin(distances))
         soc_pct = self._last.soc_pct + float(distances[weakest])
         slope = float(self._model.pseudo_ocv_slope(soc_pct)[0])
-        return CellReport(
-            cells=known,
+        return found._replace(
             weakest=self._first + weakest,
             soc_pct=min(max(soc_pct, 0.0), 100.0),
             soc_std_pct=math.sqrt(
@@ -160,16 +162,7 @@ class CellEstimator:
                 + self._last.soc_std_pct**2
             ),
             spread_pct=float(np.nanmax(distances)) - float(distances[weakest]),
-            sum_error_v=error_v,
-            sum_std_v=std_v,
-            is_sum_wrong=is_wrong,
         )
-
-    @property
-    def soc_pct(self) -> FloatArray:
-        """SoC of each cell [%], shape (n,); NaN where it was never seen."""
-        soc_pct = math.nan if self._last is None else self._last.soc_pct
-        return np.where(self._is_seen, np.clip(soc_pct + self._x[:, 0], 0.0, 100.0), np.nan)
 
     def _predict(self, seconds: float, moved_pct: float) -> None:
         dd, rr = self._P[:, 0, 0], self._P[:, 1, 1]

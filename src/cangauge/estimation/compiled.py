@@ -64,11 +64,6 @@ PROGRESS_EVERY: Final = 5000
 _core: Final = _load(Path(__file__).parents[3])
 
 
-def is_compiled() -> bool:
-    """Return whether estimators are compiled ones."""
-    return _core is not None and not os.environ.get("CANGAUGE_PURE_PYTHON")
-
-
 def make_estimator(model: Model, settings: EstimatorSettings | None = None) -> Estimator:
     """Return an estimator, compiled where the extension is present and knows the model's effects.
 
@@ -77,7 +72,7 @@ def make_estimator(model: Model, settings: EstimatorSettings | None = None) -> E
     model : Model
     settings : EstimatorSettings, optional
     """
-    if is_compiled():
+    if _core is not None and not os.environ.get("CANGAUGE_PURE_PYTHON"):
         try:
             return CompiledEstimator(model, settings)
         except ValueError as lacking:  # the core lacks an effect, or has too few places
@@ -185,8 +180,8 @@ class CompiledEstimator(Estimator):
         """Show the reference what health, power and cells are computed from."""
         learned, *arrays, time_s, moved_pct, temperature_c = self.native.view()
         load, drives, low_passed = map(np.frombuffer, arrays)
-        state: dict[str, Any] = {name: np.frombuffer(each) for name, each in learned.items()}
-        self.hypotheses.filters = [self.hypotheses.filters[0].resume(**state)]
+        state = {name: np.frombuffer(each) for name, each in learned.items()}
+        self.hypotheses.filters = [self.hypotheses.filters[0].resume({"evidence": 0.0, **state})]
         self._counter.time_s, self._counter.moved_pct = time_s, moved_pct
         self._memory.temperature_c = temperature_c
         # The reference has the drives of effects beside the SoC in one sum.

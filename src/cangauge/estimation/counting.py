@@ -236,11 +236,11 @@ class EstimatorClock:
             return stamp_s
         shift_s = self.shift_s
         step_s = stamp_s + shift_s - self.last_s
-        if age_s is not None and not step_s >= _least_step_s(age_s):
+        if age_s is not None and math.isnan(age_s):
+            age_s = UNKNOWN_INTERRUPTION_S
+        if age_s is not None and not step_s >= max(age_s - EARLY_S, SHORTEST_STEP_S):
             # The stamps restarted, or their clock was set back or stopped.
-            is_unknown = math.isnan(age_s)
-            least_s = UNKNOWN_INTERRUPTION_S if is_unknown else max(age_s, SHORTEST_INTERRUPTION_S)
-            shift_s += least_s - step_s
+            shift_s += max(age_s, SHORTEST_INTERRUPTION_S) - step_s
         elif step_s < SHORTEST_STEP_S:
             if not self._is_set_back(stamp_s, step_s):
                 return None
@@ -265,8 +265,3 @@ class EstimatorClock:
         self.behind += 1
         self.behind_s = stamp_s
         return False
-
-
-def _least_step_s(age_s: float) -> float:
-    """Return the smallest step of the stamps that agrees with an age [s]."""
-    return max((UNKNOWN_INTERRUPTION_S if math.isnan(age_s) else age_s) - EARLY_S, SHORTEST_STEP_S)

@@ -30,6 +30,7 @@ Kalman filter; Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from copy import copy
 from functools import cached_property
 from typing import Any, Final, Self
@@ -39,7 +40,7 @@ from numpy.typing import ArrayLike
 
 from cangauge._typing import FloatArray
 from cangauge.estimation.counting import UNKNOWN_STD_PCT
-from cangauge.estimation.health import FriedlandBias
+from cangauge.estimation.health import PRIOR, FriedlandBias
 from cangauge.estimation.state import Block
 from cangauge.model.extended import OnlineModel
 
@@ -259,11 +260,6 @@ class SocFilter:
         variance += self.bias.soc_error_pct2
         return float(x[SOC] + a * x[OFFSET] - discharged_pct), float(variance)
 
-    @property
-    def normalised_innovation_squared(self) -> float:
-        """Square of the last innovation over its variance; χ² with one degree under the model."""
-        return float(self.y**2 / self.S)
-
     def is_valid(self) -> bool:
         """Return whether state and variances are usable numbers."""
         is_finite = math.isfinite(self.evidence) and np.all(np.isfinite(self.x))
@@ -275,9 +271,8 @@ class SocFilter:
 
         Under the model its distribution is at most χ² with as many degrees of freedom, n + 4.
         """
-        learned = np.concatenate(
-            ([self.x[OFFSET] / OFFSET_STD_A], self.x[LEVEL:], self.bias.relative)
-        )
+        biases = self.bias.b / np.sqrt(np.diag(PRIOR))
+        learned = np.concatenate(([self.x[OFFSET] / OFFSET_STD_A], self.x[LEVEL:], biases))
         return float(learned @ learned)
 
     def joint(self) -> tuple[FloatArray, FloatArray]:
@@ -294,23 +289,18 @@ class SocFilter:
 
     def state(self) -> dict[str, Any]:
         """Return everything needed to continue."""
-        biases = {"b": self.bias.b, "b_P": self.bias.P, "b_V": self.bias.V}
+        bias = self.bias
+        biases = {"b": bias.b, "b_P": bias.P, "b_V": bias.V}
         return {"x": self.x, "P": self.P, **biases, "evidence": self.evidence}
 
-    def resume(
-        self,
-        *,
-        x: ArrayLike,
-        P: ArrayLike,
-        b: ArrayLike,
-        b_P: ArrayLike,
-        b_V: ArrayLike,
-        evidence: float = 0.0,
-    ) -> Self:
+    def resume(self, state: Mapping[str, ArrayLike]) -> Self:
         """Continue from a `state` of the same model, its matrices flat or not; return self."""
-        self.x, self.P, self.evidence = np.array(x), np.reshape(P, self.P.shape), evidence
-        bias, self.bias.b = self.bias, np.array(b)
-        bias.P, bias.V = np.reshape(b_P, bias.P.shape), np.reshape(b_V, bias.V.shape)
+        shaped = {
+            name: np.reshape(state[name], np.shape(now)) for name, now in self.state().items()
+        }
+        self.x, self.P, bias = shaped["x"], shaped["P"], self.bias
+        bias.b, bias.P, bias.V = shaped["b"], shaped["b_P"], shaped["b_V"]
+        self.evidence = float(shaped["evidence"])
         return self
 
     def take_over(self, before: SocFilter) -> None:

@@ -258,7 +258,7 @@ class Estimator:
     def _be_away(self, away_s: float, parked_pct: float) -> None:
         """Allow for a car that was charged or driven in an unobserved interval [s, %]."""
         moved_pct = moved_std_pct(away_s)
-        self.hypotheses.doubt(WRONG_PRIOR, moved_pct, away_s, parked_pct)
+        self.hypotheses.doubt(moved_pct, away_s, parked_pct)
         self._memory.coulomb_var_pct2 += WRONG_PRIOR * moved_pct**2
 
     def _use_row(self, sample: Sample) -> None:
@@ -345,14 +345,14 @@ class Estimator:
         learned of the constants lies together within their priors.
         """
         memory, limits, likelier = self._memory, self.limits, self.hypotheses.likelier
-        innovations = [*memory.innovations, likelier.normalised_innovation_squared]
+        innovations = [*memory.innovations, float(likelier.y**2 / likelier.S)]
         memory.innovations = innovations[-limits.tested_blocks :]
         is_lasting = sum(memory.innovations) > limits.innovations_at_most
         if is_lasting or likelier.strain() > limits.strain_at_most:
             memory.mismatch_until_s = time_s + checks.MISMATCH_S
         if is_lasting:  # the model may be right and the SoC wrong: charge that was not seen
             memory.innovations = []
-            self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
+            self.hypotheses.doubt(WRONG_STD_PCT)
 
     def _predict(self, to: CoulombCounter) -> None:
         """Predict the filter to a count."""

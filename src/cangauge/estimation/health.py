@@ -104,11 +104,6 @@ class FriedlandBias:
         v = self.V[0]
         return float((v @ self.b) ** 2 + v @ self.P @ v)
 
-    @property
-    def relative(self) -> FloatArray:
-        """Both in standard deviations of their prior, shape (2,)."""
-        return np.asarray(self.b / np.sqrt(np.diag(PRIOR)))
-
     def take_over(self, before: FriedlandBias, ratio: float) -> None:
         """Keep the capacity learned with another reference capacity, `ratio` times as large."""
         self.b[G] = (1.0 + before.b[G]) * ratio - 1.0

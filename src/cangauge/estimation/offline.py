@@ -20,6 +20,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import soc_at_first_row
+from cangauge.model.effects.base import Signals
 from cangauge.model.model_file import Model, as_model
 from cangauge.settings import GAP_S, VALID_STD_PCT, FullCharge, LongRest, Method
 from cangauge.types import Estimate, Sample, Status, reason_names
@@ -234,8 +235,7 @@ def estimate_log(
 
 def samples_of(log: Log) -> Iterator[Sample]:
     """Yield the log's rows as samples."""
-    columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c)
-    yield from map(Sample._make, zip(*(each.tolist() for each in columns), strict=True))
+    yield from map(Sample._make, zip(*(each.tolist() for each in Signals.of(log)), strict=True))
 
 
 def run_estimator(
@@ -264,9 +264,7 @@ def step_all(
         Called with each sample after its step.
     """
     if isinstance(estimator, CompiledEstimator) and isinstance(samples, Log) and observe is None:
-        log = samples
-        columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c)
-        found: list[Any] = estimator.run(columns, progress)
+        found: list[Any] = estimator.run(Signals.of(samples), progress)
         return EstimateTable(*found)
     estimates = []
     rows = samples_of(samples) if isinstance(samples, Log) else samples

@@ -93,11 +93,13 @@ class PowerModel:
         ahead = _Ahead(self._model, filter_, soc_pct, temperature_c)
         if 1.0 + ahead.resistance <= 0.0:  # learned of the wrong sign: not the pack's
             return Power()
-        moments = [ahead.moment(HORIZON_S * step / STEPS) for step in range(1, STEPS + 1)]
-        out = (ahead.possible(self.min_v, *moment) for moment in moments)
-        into = (ahead.possible(self.max_v, *moment) for moment in moments)
-        discharge_a, discharge_std_a = min(filter(None, out), default=UNKNOWN)
-        charge_a, charge_std_a = max(filter(None, into), default=UNKNOWN)
+        out, into = [], []
+        for step in range(1, STEPS + 1):
+            moment = ahead.moment(HORIZON_S * step / STEPS)
+            out += ahead.possible(self.min_v, *moment)
+            into += ahead.possible(self.max_v, *moment)
+        discharge_a, discharge_std_a = min(out, default=UNKNOWN)
+        charge_a, charge_std_a = max(into, default=UNKNOWN)
         return Power(
             *_within(discharge_a, discharge_std_a, self.max_discharge_a),
             *_within(-charge_a, charge_std_a, self.max_charge_a),
@@ -197,10 +199,10 @@ class _Ahead:
         base: FloatArray,
         per_a: FloatArray,
         unknown_v: float,
-    ) -> tuple[float, float] | None:
+    ) -> list[tuple[float, float]]:
         """Return the current that meets a voltage at a `moment`, and its standard deviation [A].
 
-        None: the voltage rises with the current, so it is no limit.
+        Empty: the voltage rises with the current, so it is no limit.
         """
         model = self._model
         learned_v = self._learned.at(self.soc_pct)[0]
@@ -215,7 +217,7 @@ class _Ahead:
             if abs(step_a) < 1e-3:
                 break
         if volt_per_a <= 0.0:
-            return None
+            return []
         load = base + current_a * per_a
         after_pct = self.soc_pct - pct_per_a * current_a
         slope = model.pseudo_ocv_at(after_pct)[1]
@@ -224,7 +226,7 @@ class _Ahead:
         H = np.r_[slope, 0.0, self._A, self._level_v, functions, 0.0, drop_v]
         residual_v = self._A * model.noise.residual_std_v
         std_v = math.sqrt(H @ self._P @ H + residual_v**2 + unknown_v**2)
-        return current_a, std_v / volt_per_a
+        return [(current_a, std_v / volt_per_a)]
 
     def lasting_v(self, soc_pct: FloatArray, current_a: float) -> FloatArray:
         """Return the voltages [V] of a lasting current at SoC [%] of shape (n,)."""

@@ -135,18 +135,14 @@ class Hypotheses:
         self.filters = [self.likelier]
         self.filters[0].correct(soc_pct, soc_std_pct)
 
-    def doubt(
-        self, probability: float, std_pct: float, away_s: float = 0.0, parked_std_pct: float = 0.0
-    ) -> None:
-        """Allow for the hypothesis that the SoC has become another one.
+    def doubt(self, std_pct: float, away_s: float = 0.0, parked_std_pct: float = 0.0) -> None:
+        """Allow for the hypothesis that the SoC has become another one, of prior `WRONG_PRIOR`.
 
         An older question that the voltage has not decided stays open: its wide hypothesis takes
         the new one in.
 
         Parameters
         ----------
-        probability : float
-            Its prior probability.
         std_pct : float
             Standard deviation of the SoC under it [%].
         away_s : float
@@ -155,12 +151,12 @@ class Hypotheses:
             Standard deviation of the SoC if it has not [%].
         """
         if len(self.filters) == 2 and abs(self.log_odds) < CLEAR_LOG_ODDS:
-            neither = (1.0 - self.wide_probability) * (1.0 - probability)
+            neither = (1.0 - self.wide_probability) * (1.0 - WRONG_PRIOR)
             self.prior_log_odds = _log_odds(1.0 - neither)
             self.filters[1].evidence = self.filters[0].evidence  # it is in the prior now
         else:
             self.filters = [self.likelier, self.likelier.copy()]
-            self.prior_log_odds = _log_odds(probability)
+            self.prior_log_odds = _log_odds(WRONG_PRIOR)
         self.decision = 0
         narrow, wide = self.filters
         narrow.predict(0.0, 0.0, parked_std_pct**2, away_s)
@@ -196,7 +192,7 @@ class Hypotheses:
     def resume(self, filters: list[dict[str, Any]], prior_log_odds: float, decision: int) -> None:
         """Continue from a `state` of the same model."""
         new = SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT)
-        self.filters = [new.copy().resume(**each) for each in filters]
+        self.filters = [new.copy().resume(each) for each in filters]
         self.prior_log_odds, self.decision = prior_log_odds, decision
 
     def take_over(self, before: Hypotheses) -> None:
