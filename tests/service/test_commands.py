@@ -47,7 +47,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
         f'http = "127.0.0.1:0"\nstatus_socket = "{sock}"\n'
         'record = "seen.log.gz"\nrecord_part_mb = 0.005\n'
         f"bus_options = {{ port = {bus[5].partition('=')[2]} }}\n"
-        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1, replay_clock = 0x4AF }\n"
+        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1 }\n"
     )
     service = Command("run", "--config", config, "--json")
     service.wait_for("service.ready")
@@ -80,9 +80,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert ended.json["recording"] == str(tmp_path / "seen-0001.log.gz")
     assert len(list(tmp_path.glob("seen-0001-*.log.gz"))) > 1
     # Bit for bit: the recording, offline.
-    recorded = estimate_capture(
-        ended.json["recording"], Vehicle.load("leaf_aze0"), leaf_model(), clock_id=0x4AF
-    )
+    recorded = estimate_capture(ended.json["recording"], Vehicle.load("leaf_aze0"), leaf_model())
     assert recorded.table.soc_pct.size == 1200
     for name in ("time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct"):
         assert ended.json["estimate"][name] == getattr(recorded.table, name)[-1], name

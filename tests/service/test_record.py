@@ -23,7 +23,7 @@ from cangauge.errors import InputError
 from cangauge.service import record
 from cangauge.service.offline import RecordedEstimate, estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.record import Recorder
+from cangauge.service.record import Recorder, check_recording
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate
 from live import LoggedLines, frames_of, in_process, leaf_model, leaf_model_path, short_log, waits
@@ -63,14 +63,14 @@ def write(recorder: Recorder, messages: list[can.Message]) -> None:
 
 
 def live_and_recorded(
-    path: Path, messages: list[can.Message], pipeline: Pipeline, part_bytes: float | None = None
+    path: Path, messages: list[can.Message], pipeline: Pipeline, part_mb: float | None = None
 ) -> tuple[list[Estimate], Recorder]:
     """Handle frames as the loop does; return the estimates and the closed recorder."""
     live = []
-    with Recorder(path, part_bytes) as recorder:
+    with Recorder(path, part_mb) as recorder:
         for number, message in enumerate(messages):
             recorder.on_frame(message)
-            if part_bytes and number % 100 == 0:
+            if part_mb and number % 100 == 0:
                 recorder.on_snapshot(SNAPSHOT)
                 assert waits(lambda: recorder.state["frames"] == number + 1)  # noqa: B023
             if pipeline.handle(message):
@@ -89,11 +89,11 @@ def assert_same(recorded: RecordedEstimate, live: list[Estimate]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "preset", "part_bytes"),
-    [(".log", "leaf_aze0", None), (".log.gz", "generic", None), (".log.gz", "generic", 5e3)],
+    ("suffix", "preset", "part_mb"),
+    [(".log", "leaf_aze0", None), (".log.gz", "generic", None), (".log.gz", "generic", 0.005)],
 )
 def test_a_recording_gives_the_live_numbers(
-    tmp_path: Path, suffix: str, preset: str, part_bytes: float | None
+    tmp_path: Path, suffix: str, preset: str, part_mb: float | None
 ) -> None:
     """With a clock that is set back, voltages that are missing, and a current at the end."""
     messages = frames(90.0, preset=preset)
@@ -101,9 +101,9 @@ def test_a_recording_gives_the_live_numbers(
         message.timestamp -= 4000.0
     messages = [m for n, m in enumerate(messages) if m.arbitration_id != 0x401 or n % 3]
     pipeline, sent = Pipeline(Vehicle.load(preset), leaf_model()), expected(messages)
-    live, recorder = live_and_recorded(tmp_path / f"x{suffix}", messages, pipeline, part_bytes)
+    live, recorder = live_and_recorded(tmp_path / f"x{suffix}", messages, pipeline, part_mb)
     assert (recorder.state["lost_frames"], recorder.state["frames"]) == (0, len(messages))
-    if part_bytes:
+    if part_mb:
         assert recorder.written == tmp_path / f"x-0001{suffix}"
         assert len(parts_of_run(recorder.written)) >= 3
     assert content(recorder.written) == sent
@@ -138,7 +138,7 @@ def test_a_capture_of_another_bus_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "drive.log", part_bytes=2_000) as recorder:
+    with Recorder(tmp_path / "drive.log", part_mb=0.002) as recorder:
         write(recorder, frames(20.0))
     arguments = (recorder.written, "--vehicle", "generic", "--json")
     ended = in_process("estimate", *arguments, "-m", leaf_model_path(), "-o", tmp_path / "soc.csv")
@@ -157,7 +157,7 @@ def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
 
 def test_the_oldest_parts_are_removed(tmp_path: Path) -> None:
     for _ in range(3):
-        with Recorder(tmp_path / "drive.log", 4_000, 40_000) as recorder:
+        with Recorder(tmp_path / "drive.log", 0.004, 0.04) as recorder:
             write(recorder, frames(30.0))
     parts = all_parts(tmp_path / "drive.log")
     assert {run for run, _, _ in parts} <= {2, 3}
@@ -169,7 +169,7 @@ def test_an_old_part_that_cannot_be_removed_ends_no_start(tmp_path: Path) -> Non
     (tmp_path / "r-0001-000001.log").mkdir()
     (tmp_path / "r-0001-000002.log").write_bytes(bytes(2000))
     with LoggedLines("cangauge.service.record") as logged:
-        recorder = Recorder(tmp_path / "r.log", 1000.0, 1000.0)
+        recorder = Recorder(tmp_path / "r.log", 0.001, 0.001)
         recorder.on_frame(can.Message())
         recorder.close()
     assert recorder.state["lost_frames"] == 1
@@ -178,12 +178,12 @@ def test_an_old_part_that_cannot_be_removed_ends_no_start(tmp_path: Path) -> Non
 
 def test_impossible_recordings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="record_part_mb"):
-        Recorder(tmp_path / "drive.log", keep_bytes=1)
+        check_recording(tmp_path / "drive.log", None, 1.0)
     with pytest.raises(InputError, match="does not exist"):
-        Recorder(tmp_path / "no" / "drive.log")
+        check_recording(tmp_path / "no" / "drive.log", None, None)
     for name in ("drive.asc", "drive.csv", "drive", "drive.gz"):
         with pytest.raises(InputError, match="candump"):
-            Recorder(tmp_path / name)
+            check_recording(tmp_path / name, None, None)
     with Recorder(tmp_path / "private.log"):
         pass
     assert (tmp_path / "private.log").stat().st_mode & 0o777 == 0o640 & ~_umask()
@@ -254,7 +254,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
     folder = tmp_path / "stick"
     folder.mkdir()
     messages = frames(20.0)
-    with Recorder(folder / "drive.log", part_bytes=2_000) as recorder:
+    with Recorder(folder / "drive.log", part_mb=0.002) as recorder:
         write(recorder, messages[:100])
         assert waits(lambda: recorder.state["frames"] == 100)
         folder.rename(tmp_path / "gone")

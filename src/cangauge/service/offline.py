@@ -40,7 +40,7 @@ from cangauge.logs.read import CellColumns
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.settings import REPLAY_CLOCK_ID, FrameIds, TimeSourceName
+from cangauge.settings import TimeSourceName
 from cangauge.types import Estimate, Reason, Sample, reason_name, reason_sentences
 
 PACK_EVERY_S: Final = 1.0
@@ -258,7 +258,6 @@ def estimate_capture(
     model: Model,
     settings: EstimatorSettings | None = None,
     *,
-    clock_id: int = REPLAY_CLOCK_ID,
     keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
@@ -275,8 +274,6 @@ def estimate_capture(
         Its temperature source replaces an unknown one of `settings`.
     model : Model
     settings : EstimatorSettings, optional
-    clock_id : int
-        REPLAY_CLOCK's id.
     keeps_pack : bool
         Keep health, power and cells of each second (`pack_rows`), not only of the end.
     progress : callable, optional
@@ -292,11 +289,10 @@ def estimate_capture(
     capture = open_vehicle_capture(path, vehicle)
 
     def open_bus(source: TimeSourceName) -> _Bus:
-        ids = FrameIds(replay_clock=clock_id)
-        chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
+        chosen = PipelineSettings(settings or EstimatorSettings(), source)
         return _Bus(Pipeline(vehicle, model, chosen, publishes=False))
 
-    frames = frames_of_buses(capture, buses, open_bus, clock_id)
+    frames = frames_of_buses(capture, buses, open_bus)
     for number, (bus, message) in enumerate(frames, start=1):
         if bus.pipeline.handle(message):
             bus.collect(keeps_pack=keeps_pack)

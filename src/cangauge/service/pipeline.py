@@ -115,7 +115,6 @@ class Pipeline:
         self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: PackReport | None = None
-        self._findings: tuple[Reason, Reason, bool, bool] | None = None
         self.estimator = make_estimator(model, _with_sensors(settings.estimator, vehicle))
         self._begin_signals()
 
@@ -251,17 +250,10 @@ class Pipeline:
         other do not make an estimate fresh.
         """
         estimate = self._estimate
-        signals, lacks_voltage = self.decoder.reasons(now_s), self._lacks_voltage
-        is_refused = self._refused >= MISSED_UNTIL_OLD
-        findings = estimate.reasons, signals, lacks_voltage, is_refused
-        if findings != self._findings:  # they change seldom, and flags are slow
-            bits = int(estimate.reasons) & ~_VOLTAGE_MISSING | int(signals)
-            bits |= _VOLTAGE_MISSING * lacks_voltage | _INPUT_STALE * is_refused
-            self._findings, self._reasons = findings, REASONS[bits]
-            self._status = status_of(self._reasons)
-        if self._reasons is estimate.reasons:
-            return estimate
-        return estimate._replace(reasons=self._reasons, status=self._status)
+        bits = int(estimate.reasons) & ~_VOLTAGE_MISSING | int(self.decoder.reasons(now_s))
+        bits |= _VOLTAGE_MISSING * self._lacks_voltage
+        bits |= _INPUT_STALE * (self._refused >= MISSED_UNTIL_OLD)
+        return _with_reasons(estimate, REASONS[bits])
 
     # --- estimates → frames
 
@@ -321,8 +313,7 @@ class Pipeline:
 
         While samples come that charge is little: the estimate is then invalid by model or sign.
         """
-        if reasons:
-            estimate = _with_reasons(estimate, estimate.reasons | reasons)
+        estimate = _with_reasons(estimate, estimate.reasons | reasons)
         if estimate.status is not Status.INVALID:
             return estimate
         missing_pct = self.estimator.uncounted_std_pct(silent_s)
@@ -417,6 +408,8 @@ def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
 
 
 def _with_reasons(estimate: Estimate, reasons: Reason) -> Estimate:
+    if reasons is estimate.reasons:  # the usual case
+        return estimate
     return estimate._replace(reasons=reasons, status=status_of(reasons))
 
 

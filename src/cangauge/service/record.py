@@ -45,39 +45,37 @@ class Recorder(Output):
     """The recording of a service: one file, or parts.
 
     If the file exists already (a restarted service must not overwrite its predecessor's recording),
-    or with `part_bytes`, runs and parts are numbered. No method waits for the disk but the
+    or with `part_mb`, runs and parts are numbered. No method waits for the disk but the
     constructor, and `close` for a limited time.
 
     Parameters
     ----------
     path : path-like
-    part_bytes : float, optional
-        Size at which a new part begins [bytes].
-    keep_bytes : float, optional
-        Total size above which the oldest parts are removed when a new one begins [bytes].
+    part_mb : float, optional
+        Size at which a new part begins [MB].
+    keep_mb : float, optional
+        Total size above which the oldest parts are removed when a new one begins [MB].
 
     Attributes
     ----------
     written : Path
         The recording, for `estimate`.
 
-    Raises
-    ------
-    InputError
-        If the suffix is unknown, the folder missing or not writable, or nothing can be removed.
+    See Also
+    --------
+    check_recording : Checks the arguments; a service calls it before anything is opened.
     """
 
     def __init__(
         self,
         path: str | os.PathLike[str],
-        part_bytes: float | None = None,
-        keep_bytes: float | None = None,
+        part_mb: float | None = None,
+        keep_mb: float | None = None,
     ) -> None:
-        check_recording(Path(path), part_bytes, keep_bytes)
         self._batch: list[can.Message] = []
         self._frames = self._refused_frames = self._unwritten_frames = 0
         self._problem: str | None = None
-        self._file = _RecordFile(Path(path), part_bytes, keep_bytes)
+        self._file = _RecordFile(Path(path), part_mb, keep_mb)
         self.written = self._file.path
         self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
 
@@ -147,10 +145,10 @@ class Recorder(Output):
 class _RecordFile:
     """The file or the parts of one recording, written batch by batch; methods may raise OSError."""
 
-    def __init__(self, base: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
+    def __init__(self, base: Path, part_mb: float | None, keep_mb: float | None) -> None:
         base = written_name(base) if base.is_symlink() else base
-        self._base, self._part_bytes, self._keep_bytes = base, part_bytes, keep_bytes
-        self._in_parts = part_bytes is not None or os.path.lexists(base)
+        self._base, self._part_mb, self._keep_mb = base, part_mb, keep_mb
+        self._in_parts = part_mb is not None or os.path.lexists(base)
         self._run = max((run for run, _, _ in all_parts(base)), default=0) + 1
         self._part = self._bytes = self.written_bytes = 0
         self.path = run_path(base, self._run) if self._in_parts else base
@@ -161,7 +159,7 @@ class _RecordFile:
 
     def write(self, batch: list[can.Message]) -> None:
         """Append frames as whole lines, or nothing of them."""
-        is_full = self._part_bytes is not None and self._bytes >= self._part_bytes
+        is_full = self._part_mb is not None and self._bytes >= 1e6 * self._part_mb
         if self._descriptor < 0 or is_full:
             self._next_part()
         if time.monotonic() - self._synced_s >= SYNC_EVERY_S:
@@ -208,19 +206,19 @@ class _RecordFile:
         self._writer.last_timestamp = 0.0
 
     def _remove_oldest(self) -> None:
-        if self._keep_bytes is None:
+        if self._keep_mb is None:
             return
         sizes = {path: path.stat().st_size for _, _, path in all_parts(self._base)}
         total = sum(sizes.values())
         for path, size in sizes.items():
-            if total <= self._keep_bytes:
+            if total <= 1e6 * self._keep_mb:
                 return
             path.unlink(missing_ok=True)
             total -= size
             emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
 
 
-def check_recording(path: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
+def check_recording(path: Path, part_mb: float | None, keep_mb: float | None) -> None:
     """Raise InputError for a recording that cannot be written, or not be limited."""
     if not path.name.lower().removesuffix(".gz").endswith(".log"):
         raise InputError(
@@ -229,7 +227,7 @@ def check_recording(path: Path, part_bytes: float | None, keep_bytes: float | No
             field="--record",
             cure="name a .log or .log.gz file; `python -m can.logconvert` turns it into others",
         )
-    if keep_bytes is not None and part_bytes is None:
+    if keep_mb is not None and part_mb is None:
         raise InputError(
             "the recording is one file, which is never removed",
             field="record_keep_mb",

@@ -89,8 +89,6 @@ class Service:
             else partial(load_config, config, options)
         )
         config = self._read()
-        limits_mb = config.record_part_mb, config.record_keep_mb
-        self._record_limits = [None if each is None else 1e6 * each for each in limits_mb]
         with config.naming_keys():
             self._state = state_path(config.state, os.environ)
             self._check_files(config)
@@ -149,7 +147,9 @@ class Service:
                 keeper = StateKeeper(self._state, pipeline, port.name, config.state_max_age_s)
                 checkpoint = stack.enter_context(keeper).checkpoint
             if config.record is not None:
-                self.recorder = Recorder(config.record, *self._record_limits)
+                self.recorder = Recorder(
+                    config.record, config.record_part_mb, config.record_keep_mb
+                )
                 self._outputs.insert(0, self.recorder)
             for output in self._outputs:
                 stack.callback(output.close)
@@ -245,7 +245,7 @@ class Service:
                         "is another file of this service", field="--state", value=other
                     )
         if config.record is not None:
-            check_recording(Path(config.record), *self._record_limits)
+            check_recording(Path(config.record), config.record_part_mb, config.record_keep_mb)
 
 
 def log_end(status: Mapping[str, Any]) -> None:
