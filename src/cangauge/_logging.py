@@ -3,7 +3,7 @@
 Modules log through the standard library and name their event::
 
     _LOG = logging.getLogger(__name__)
-    emit(_LOG, logging.WARNING, "bus.lost", "socketcan can0 is down", retry_s=1.0)
+    emit(_LOG.warning, "bus.lost", "socketcan can0 is down", retry_s=1.0)
 
 Names (`area.what_happened`) are stable; texts may change. Callers log every occurrence: whoever
 writes the records limits their rate (`service.events`).
@@ -11,22 +11,21 @@ writes the records limits their rate (`service.events`).
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Callable
 
 
 def emit(
-    logger: logging.Logger,
-    level: int,
+    log: Callable[..., None],
     event: str,
     text: str,
     *,
     limit: str | None = None,
     **fields: object,
 ) -> None:
-    """Log one event: its stable name, and one line for people.
+    """Log one event by a method of a logger: its stable name, and one line for people.
 
     Events with the same `limit` share one rate limit, as they supersede each other (the states of
     a bus). `fields` are further keys of the JSON object, with units in their names.
     """
     extra = {"event": event, "limit": limit or event, "fields": fields}
-    logger.log(level, "%s", text, extra=extra)
+    log("%s", text, extra=extra)

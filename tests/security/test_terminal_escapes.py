@@ -44,7 +44,7 @@ def test_rich_keeps_its_own_styles(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("log_format", ["text", "json"])
 def test_events(log_format: LogFormat, capsys: pytest.CaptureFixture[str]) -> None:
     with logging_to(log_format):
-        emit(LOG, logging.WARNING, "bus.lost", HOSTILE + "\nforged", channel=HOSTILE)
+        emit(LOG.warning, "bus.lost", HOSTILE + "\nforged", channel=HOSTILE)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert not CONTROLS.search(lines[0])

@@ -26,9 +26,9 @@ LOG = logging.getLogger("cangauge.test")
 def logged(log_format: LogFormat, level: str = "info") -> list[str]:
     stream = io.StringIO()
     with logging_to(log_format, level, stream):  # type: ignore[arg-type] # a level
-        emit(LOG, logging.INFO, "bus.lost", "can0 is\ndown", retry_s=0.25, why=float("nan"))
-        emit(LOG, logging.DEBUG, "bus.detail", "too much")
-        emit(LOG, logging.WARNING, "bus.said", "100 % busy")
+        emit(LOG.info, "bus.lost", "can0 is\ndown", retry_s=0.25, why=float("nan"))
+        emit(LOG.debug, "bus.detail", "too much")
+        emit(LOG.warning, "bus.said", "100 % busy")
         logging.getLogger("can.socketcan").warning("libraries chatter")
         logging.getLogger("asyncio").error("oh %s", "no", exc_info=OSError("gone"))
     return stream.getvalue().splitlines()
@@ -62,7 +62,7 @@ def test_a_closed_stream_is_ignored(capsys: pytest.CaptureFixture[str]) -> None:
     stream = io.StringIO()
     with logging_to("text", stream=stream):
         stream.close()
-        emit(LOG, logging.INFO, "bus.lost", "nobody hears it")
+        emit(LOG.info, "bus.lost", "nobody hears it")
     assert capsys.readouterr().err == ""
 
 
@@ -130,7 +130,7 @@ def test_suppressed_records_are_written_when_due() -> None:
     stream, before = io.StringIO(), threading.active_count()
     with logging_to("text", stream=stream):
         for number in range(3):
-            emit(LOG, logging.INFO, "bus.lost", f"try {number}")
+            emit(LOG.info, "bus.lost", f"try {number}")
 
         def is_released() -> bool:
             release_held()
@@ -144,9 +144,9 @@ def test_events_of_one_limit_supersede_each_other() -> None:
     stream = io.StringIO()
     with logging_to("text", stream=stream):
         for number in range(3):
-            emit(LOG, logging.WARNING, "bus.lost", f"lost {number}", limit="bus.state")
-            emit(LOG, logging.INFO, "bus.back", f"back {number}", limit="bus.state")
-            emit(LOG, logging.INFO, "a.c", f"other {number}")
+            emit(LOG.warning, "bus.lost", f"lost {number}", limit="bus.state")
+            emit(LOG.info, "bus.back", f"back {number}", limit="bus.state")
+            emit(LOG.info, "a.c", f"other {number}")
     lines = [line.partition(" ")[2] for line in stream.getvalue().splitlines()]
     assert lines == [
         "WARNING bus.lost: lost 0",

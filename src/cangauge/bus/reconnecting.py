@@ -61,7 +61,7 @@ class ReconnectingBus(BusConnection):
                 raise
             self._schedule_attempt()
             text = f"not available yet ({error}); waiting for it"
-            self._log("bus.missing", logging.WARNING, text)
+            self._log("bus.missing", _LOG.warning, text)
         self._since_s = time.monotonic()
 
     def close(self) -> None:
@@ -126,9 +126,9 @@ class ReconnectingBus(BusConnection):
             if self.is_off:
                 cure = f"ip link set {self.address.channel} type can restart-ms 100"
                 text = "the controller is bus-off until the kernel restarts it"
-                self._log("bus.off", logging.WARNING, f"{text} (automatically: {cure})")
+                self._log("bus.off", _LOG.warning, f"{text} (automatically: {cure})")
             else:
-                self._log("bus.on", logging.INFO, "no longer bus-off")
+                self._log("bus.on", _LOG.info, "no longer bus-off")
         return messages
 
     def _lose(self, error: BusError) -> None:
@@ -142,7 +142,7 @@ class ReconnectingBus(BusConnection):
                 bus.shutdown()
         self._was_off, self._failed, self._since_s = False, None, now_s
         self._schedule_attempt()
-        emit(_LOG, logging.WARNING, "bus.lost", f"{error} Reconnecting")
+        emit(_LOG.warning, "bus.lost", f"{error} Reconnecting")
 
     def _schedule_attempt(self) -> None:
         self._retry_at_s = time.monotonic() + self._pause_s
@@ -162,7 +162,7 @@ class ReconnectingBus(BusConnection):
             if away_s >= LONGEST_PAUSE_S:  # a short outage needs one line
                 reason = str(error) or type(error).__name__
                 text = f"away for {away_s:.0f} s ({reason}); retrying"
-                self._log("bus.away", logging.WARNING, text)
+                self._log("bus.away", _LOG.warning, text)
             return
         now_s = time.monotonic()
         away_s, self._since_s = now_s - self._since_s, now_s
@@ -172,7 +172,7 @@ class ReconnectingBus(BusConnection):
             super().close()
             return
         text = f"{'back' if self.losses else 'available'} after {away_s:.1f} s"
-        self._log("bus.back", logging.INFO, text)
+        self._log("bus.back", _LOG.info, text)
 
-    def _log(self, event: str, level: int, text: str) -> None:
-        emit(_LOG, level, event, f"{self.name}: {text}")
+    def _log(self, event: str, log: Callable[..., None], text: str) -> None:
+        emit(log, event, f"{self.name}: {text}")

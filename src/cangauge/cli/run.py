@@ -82,7 +82,7 @@ def run_command(
             result = service.run()
         except CangaugeError as error:
             if loaded.log_format == "json":  # each line of stderr is an object
-                emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
+                emit(_LOG.error, "service.failed", str(error), exit_code=error.exit_code)
                 error.logged = True
             raise
         if json_output:

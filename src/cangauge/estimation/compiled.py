@@ -48,8 +48,7 @@ def _load(root: Path) -> Any:
     folder = root / "core"
     if (folder / "cangauge.h").is_file() and sources_digest(folder) != core.SOURCES:
         emit(
-            _LOG,
-            logging.WARNING,
+            _LOG.warning,
             "core.stale",
             "the compiled core is not of these sources: continuing in Python; "
             "compile it by `python hatch_build.py`",
@@ -76,7 +75,7 @@ def make_estimator(model: Model, settings: EstimatorSettings | None = None) -> E
         try:
             return CompiledEstimator(model, settings)
         except ValueError as lacking:  # the core lacks an effect, or has too few places
-            emit(_LOG, logging.INFO, "core.lacking", f"estimating in Python: {lacking}")
+            emit(_LOG.info, "core.lacking", f"estimating in Python: {lacking}")
     return Estimator(model, settings)
 
 

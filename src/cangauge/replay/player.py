@@ -277,7 +277,7 @@ class _Player:
                 self.in_flight.clear()
                 self._incomplete = 0
                 text = f"{state.lost} samples lost so far; the replay continues"
-                emit(_LOG, logging.WARNING, "replay.lost", text)
+                emit(_LOG.warning, "replay.lost", text)
             elif now_s - last_s > self._within_s:
                 problem = "no receiver: no SOC_DETAIL"
                 if self.is_ready():

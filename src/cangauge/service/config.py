@@ -437,9 +437,12 @@ def load_config(
         option = config_keys().get(field, {}).get("option", field).rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
     if "model" not in merged:
-        field = "-m/--model" if path is None else "model"
-        cure = "give -m MODEL (made by `cangauge fit`)"
-        raise InputError("is missing", source=path, field=field, cure=cure)
+        raise InputError(
+            "is missing",
+            source=path,
+            field="-m/--model" if path is None else "model",
+            cure="give -m MODEL (made by `cangauge fit`)",
+        )
     return config if path is None else config.named(path, given)
 
 

@@ -28,7 +28,7 @@ from cangauge.service.status import Monitor
 from cangauge.types import Estimate, Reason
 
 _LOG = logging.getLogger(__name__)
-_warn = partial(emit, _LOG, logging.WARNING)
+_warn = partial(emit, _LOG.warning)
 
 LATE_S: Final = 0.01
 """Longest time that due frames wait for a sample to arrive [s]."""
@@ -211,9 +211,12 @@ class Loop:
         """Note a frame with an id that this service publishes: its echo, or another sender."""
         own = self._published
         if not own.is_echo(message) and own.proves_another(self._now_s):
-            text = f"another node on this bus sends 0x{message.arbitration_id:X}, which this"
-            text += " service publishes: is a second service running? Give one of them other ids"
-            _warn("bus.duplicate_sender", f"{text} ([ids] of the configuration)")
+            _warn(
+                "bus.duplicate_sender",
+                f"another node on this bus sends 0x{message.arbitration_id:X}, which this service"
+                " publishes: is a second service running? Give one of them other ids ([ids] of the"
+                " configuration)",
+            )
         self._monitor.foreign = own.foreign
 
     def _note_request(self, message: can.Message) -> None:
@@ -225,9 +228,11 @@ class Loop:
         """Note REPLAY_CLOCK, which this service does not use."""
         if not self._replay_was_seen and log_time_us(message.data) is not None:
             self._replay_was_seen = True
-            text = "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service"
-            text += " uses receive stamps; to use the log's time, run with"
-            _warn("bus.replay_clock_ignored", f"{text} --time-source replay-clock")
+            _warn(
+                "bus.replay_clock_ignored",
+                "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service uses"
+                " receive stamps; to use the log's time, run with --time-source replay-clock",
+            )
 
     def _give_sample(self, estimate: Estimate) -> None:
         self._give("on_sample", self._pipeline.latest_sample, estimate)
@@ -242,8 +247,7 @@ class Loop:
                 getattr(output, method)(*news)
             except Exception as error:  # noqa: BLE001 - whatever it is, the SoC frames continue
                 name = type(output).__name__
-                text = f"{name} has ended: {error!r}"
-                emit(_LOG, logging.ERROR, "output.failed", text, limit=name)
+                emit(_LOG.error, "output.failed", f"{name} has ended: {error!r}", limit=name)
                 self._outputs.remove(output)
 
     # --- estimates → frames
@@ -268,8 +272,12 @@ class Loop:
         step_s = self._pipeline.stamp_shift_s - self._stamps.shift_s
         self._pipeline.stamp_shift_s = self._stamps.shift_s
         if abs(step_s) >= 1.0:  # smaller ones are the clock's drift
-            text = f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
-            _warn("bus.clock_set", f"{text} the monotonic clock", step_s=step_s)
+            _warn(
+                "bus.clock_set",
+                f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows the"
+                " monotonic clock",
+                step_s=step_s,
+            )
 
     def _find(self) -> dict[str, str]:
         """Return what is wrong with time and signals at present: a sentence by event."""
@@ -332,8 +340,11 @@ class Loop:
         now_s, drops = self._now_s, self._port.queue_drops or 0
         if drops > self._drops:
             lost, self._drops = drops - self._drops, drops
-            text = f"{self._port.name}: the receive queue overflowed: {lost} frames lost"
-            _warn("bus.queue_overflow", f"{text} ({drops} so far)")
+            _warn(
+                "bus.queue_overflow",
+                f"{self._port.name}: the receive queue overflowed: {lost} frames lost ({drops} so"
+                " far)",
+            )
         if now_s >= self._save_due_s:
             self._save_due_s = now_s + self._config.state_every_s
             self._save()

@@ -39,6 +39,7 @@ BATCHES_WAITING: Final = 600
 SYNC_EVERY_S: Final = 30.0
 """Interval of fsync, against power cuts [s]."""
 _LOG = logging.getLogger(__name__)
+_emit_state = partial(emit, limit="record.state")
 
 
 class Recorder(Output):
@@ -106,8 +107,11 @@ class Recorder(Output):
         self._hand_over()
         self._worker.submit(self._file.close)
         if not self._worker.close(CLOSE_WITHIN_S):
-            text = f"{self._file.current}: the end of the recording is missing"
-            emit(_LOG, logging.ERROR, "record.incomplete", text)
+            emit(
+                _LOG.error,
+                "record.incomplete",
+                f"{self._file.current}: the end of the recording is missing",
+            )
 
     def _hand_over(self) -> None:
         batch, self._batch = self._batch, []
@@ -127,19 +131,23 @@ class Recorder(Output):
         self._frames += len(batch)
         lost = self.state["lost_frames"]
         if problem is not None:
-            text = f"recording: {problem}; the estimate continues, writing is retried"
-            self._say(logging.ERROR, "record.failed", text, lost)
+            _emit_state(
+                _LOG.error,
+                "record.failed",
+                f"recording: {problem}; the estimate continues, writing is retried",
+                lost_frames=lost,
+            )
         elif before is not None:
-            text = f"recording resumed; {lost} frames were lost"
-            self._say(logging.WARNING, "record.resumed", text, lost)
+            _emit_state(
+                _LOG.warning,
+                "record.resumed",
+                f"recording resumed; {lost} frames were lost",
+                lost_frames=lost,
+            )
 
     @staticmethod
     def _failed(error: Exception) -> None:
-        emit(_LOG, logging.ERROR, "record.failed", f"recording: {error}", limit="record.state")
-
-    @staticmethod
-    def _say(level: int, event: str, text: str, lost_frames: int) -> None:
-        emit(_LOG, level, event, text, limit="record.state", lost_frames=lost_frames)
+        _emit_state(_LOG.error, "record.failed", f"recording: {error}")
 
 
 class _RecordFile:
@@ -215,7 +223,7 @@ class _RecordFile:
                 return
             path.unlink(missing_ok=True)
             total -= size
-            emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
+            emit(_LOG.info, "record.removed", f"removed the oldest part: {path}")
 
 
 def check_recording(path: Path, part_mb: float | None, keep_mb: float | None) -> None:

@@ -167,9 +167,14 @@ class Service:
             for make_output in self._setup.outputs:
                 self._outputs.append(make_output(self))
                 stack.callback(self._outputs[-1].close)
-            text = f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends"
-            about = {"bus": port.name, "vehicle": pipeline.vehicle.name, "model": config.model}
-            emit(_LOG, logging.INFO, "service.ready", text, **about)
+            emit(
+                _LOG.info,
+                "service.ready",
+                f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends",
+                bus=port.name,
+                vehicle=pipeline.vehicle.name,
+                model=config.model,
+            )
             notifier.send(READY=1, STATUS=f"listening on {port.name}")
             stack.callback(notifier.send, STOPPING=1, STATUS="stopping")
             loop = Loop(
@@ -204,8 +209,11 @@ class Service:
             with new.config.naming_keys():
                 self.pipeline.reconfigure(new.vehicle, new.model, new.settings)
         except CangaugeError as error:
-            text = f"new configuration refused, the old one stays: {error}"
-            emit(_LOG, logging.WARNING, "config.refused", text)
+            emit(
+                _LOG.warning,
+                "config.refused",
+                f"new configuration refused, the old one stays: {error}",
+            )
             return str(error)
         _log_changes(self._setup, new)
         self._setup = new
@@ -256,20 +264,24 @@ def log_end(status: Mapping[str, Any]) -> None:
         for name, count in status["bus_counts"].items()
         if count
     )
-    text = (
+    emit(
+        _LOG.info,
+        "service.stopped",
         f"{status['uptime_s']:.1f} s, {frames['received']} frames, {status['samples']} samples,"
         f" {frames['lost']} lost, {status['rejects']['crc_errors']} CRC errors{errors};"
         f" last SoC {known_soc(estimate['soc_pct'], estimate['soc_std_pct'], 2)}"
         f" ({status['status']});"
-        f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
+        f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)",
     )
-    emit(_LOG, logging.INFO, "service.stopped", text)
     if not frames["received"]:
-        text = f"{status['bus']}: no expected frame arrived; check channel, bit rate and vehicle"
-        text += " (--vehicle or --map)"
-        emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
+        emit(
+            _LOG.warning,
+            "bus.nothing_wanted",
+            f"{status['bus']}: no expected frame arrived; check channel, bit rate and vehicle"
+            " (--vehicle or --map)",
+        )
     if (path := status["recording"]) is not None:
-        emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
+        emit(_LOG.info, "file.written", f"written: {path}", path=path)
 
 
 def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path | None:
@@ -284,7 +296,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path
     except CangaugeError as error:
         if is_asked_for:
             raise
-        emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
+        emit(_LOG.warning, "status.unavailable", f"no status socket: {error}")
         return None
     return path
 
@@ -300,7 +312,10 @@ def _log_changes(old: Setup, new: Setup) -> None:
     text = f"configuration reloaded; changed: {', '.join(changed) or 'nothing'}"
     if old.vehicle.battery != new.vehicle.battery:
         text += "; current or voltage are decoded otherwise: the SoC starts anew from the voltage"
-    emit(_LOG, logging.INFO, "config.reloaded", text)
+    emit(_LOG.info, "config.reloaded", text)
     if late := ", ".join(name for name in names if keys[name]["restart"]):
-        text = f"{late}: takes effect after a restart of the service"
-        emit(_LOG, logging.WARNING, "config.needs_restart", text)
+        emit(
+            _LOG.warning,
+            "config.needs_restart",
+            f"{late}: takes effect after a restart of the service",
+        )

@@ -31,7 +31,7 @@ from cangauge._files import (
     written_name,
 )
 from cangauge._logging import emit
-from cangauge._text import duration, number
+from cangauge._text import duration, known_soc
 from cangauge.errors import InputError
 from cangauge.estimation.state import EstimatorState
 from cangauge.service.pipeline import Pipeline
@@ -130,8 +130,7 @@ class StateKeeper:
     def __enter__(self) -> Self:
         remove_parts(self._path)
         if not os.path.exists(self._path):  # noqa: PTH110 - never raises
-            text = f"{self._path}: no saved state; starting without one"
-            emit(_LOG, logging.INFO, "state.none", text)
+            emit(_LOG.info, "state.none", f"{self._path}: no saved state; starting without one")
             return self
         try:
             if not is_own(written_name(self._path).lstat()):  # a link of another user, or his file
@@ -146,16 +145,22 @@ class StateKeeper:
         ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
         if content.estimator.writer != self._pipeline.estimator.writer:
             ago += ", of another release, method or capacity, of which the SoC alone is kept"
-        soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
-        text = f"{self._path}: continuing from a state {ago}: SoC {soc}"
-        emit(_LOG, logging.INFO, "state.restored", text)
+        soc = known_soc(latest.soc_pct, latest.soc_std_pct, 2)
+        emit(
+            _LOG.info,
+            "state.restored",
+            f"{self._path}: continuing from a state {ago}: SoC {soc}",
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
         self.checkpoint()
         if not self._worker.close(CLOSE_WITHIN_S):
-            text = f"{self._path}: the last state was not written in time"
-            emit(_LOG, logging.WARNING, "state.failed", text)
+            emit(
+                _LOG.warning,
+                "state.failed",
+                f"{self._path}: the last state was not written in time",
+            )
 
     def checkpoint(self) -> None:
         """Start saving the state if it has new samples; return at once."""
@@ -190,14 +195,19 @@ class StateKeeper:
         path, names = self._path, {"model": content.model_name, "battery": content.vehicle_name}
         for field, wanted in self._uses().items():
             if (owner := getattr(content, field)) != wanted:
-                text = f"of another {field.replace('_', ' ')} ({names.get(field, owner)})"
-                raise InputError(text, source=path, field=field)
+                raise InputError(
+                    f"of another {field.replace('_', ' ')} ({names.get(field, owner)})",
+                    source=path,
+                    field=field,
+                )
         if content.time_source == "replay-clock":
             return 0.0
         age_s, limit_s = self._wall_s() - content.saved_s, self._max_age_s
         if age_s > limit_s:
-            text = f"{age_s / 3600.0:.1f} h old, more than the limit of {limit_s / 3600.0:g} h"
-            raise InputError(text, source=path)
+            raise InputError(
+                f"{age_s / 3600.0:.1f} h old, more than the limit of {limit_s / 3600.0:g} h",
+                source=path,
+            )
         if age_s < -CLOCKS_APART_S:
             return math.nan
         return max(age_s, REBOOT_S if content.boot_id != self._boot_id else 0.0)
@@ -215,16 +225,14 @@ class StateKeeper:
         how = "without one"
         if self._pipeline.discard_initial_soc():
             how = "from the voltage, since the given initial SoC is outdated"
-        text = f"state refused: {error}{kept}; starting {how}"
-        emit(_LOG, logging.WARNING, "state.refused", text)
+        emit(_LOG.warning, "state.refused", f"state refused: {error}{kept}; starting {how}")
 
     def _write(self, content: StateContent) -> None:
         with atomic_path(self._path, rights=0o600) as part:
             part.write_text(state_text(content), encoding="utf-8")
 
     def _failed(self, error: Exception) -> None:
-        text = f"state not written: {self._path}: {error}"
-        emit(_LOG, logging.WARNING, "state.failed", text)
+        emit(_LOG.warning, "state.failed", f"state not written: {self._path}: {error}")
 
 
 def state_text(content: StateContent) -> str:

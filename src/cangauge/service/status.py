@@ -268,14 +268,13 @@ class Monitor:
         """Log a change of the status, and notices once when they appear."""
         notices = self._find_notices()
         for event in notices.keys() - self._notices.keys():
-            emit(_LOG, logging.WARNING, event, notices[event])
+            emit(_LOG.warning, event, notices[event])
         self._notices = notices
         if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
         emit(
-            _LOG,
-            logging.WARNING if estimate.status is Status.INVALID else logging.INFO,
+            _LOG.warning if estimate.status is Status.INVALID else _LOG.info,
             "status.changed",
             self._line(),
             status=estimate.status.name.lower(),

@@ -175,7 +175,7 @@ class StatusSocket:
                 connection, _ = self._socket.accept()
             except OSError as error:  # out of descriptors, or closed
                 if not self._is_closed:
-                    emit(_LOG, logging.WARNING, "status.failed", f"no connection accepted: {error}")
+                    emit(_LOG.warning, "status.failed", f"no connection accepted: {error}")
                     time.sleep(SEND_WITHIN_S)
                 continue
             with connection, suppress(OSError):
@@ -239,8 +239,7 @@ def fetch_status(path: Path) -> dict[str, Any]:
                 answer += part
                 connection.settimeout(max(until_s - time.monotonic(), 1e-3))
     except OSError as error:
-        text = f"{path}: no service answers: {error.strerror or error}"
-        raise NotRunningError(text) from error
+        raise NotRunningError(f"{path}: no service answers: {error.strerror or error}") from error
     try:
         content = json.loads(answer)
         if content["schema"] == SCHEMA:

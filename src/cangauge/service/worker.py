@@ -21,8 +21,10 @@ def start_thread(run: Callable[[], object], name: str) -> threading.Thread:
     try:
         thread.start()
     except RuntimeError as error:
-        cure = "raise the limit of threads (ulimit -u, TasksMax=) or memory (ulimit -v)"
-        raise CangaugeError(f"{name}: {error}; {cure}") from error
+        raise CangaugeError(
+            f"{name}: {error}; raise the limit of threads (ulimit -u, TasksMax=) or memory"
+            " (ulimit -v)"
+        ) from error
     return thread
 
 

@@ -122,7 +122,7 @@ class Gateway(Output):
             bus.close()
             if bus.unsent:
                 text = f"{bus.unsent} frames could not be handed on to {bus.name}"
-                emit(_LOG, logging.WARNING, "inverter.unsent", text)
+                emit(_LOG.warning, "inverter.unsent", text)
 
     def soc_pct(self, now_s: float) -> float | None:
         """Return the SoC that may be sent at a monotonic time [s]; None: the battery's own."""
@@ -158,7 +158,7 @@ class Gateway(Output):
         self._replaces = is_replaced
         self.trouble = "" if is_replaced else "the inverter gets the battery's own SoC"
         text = "the inverter gets the estimated SoC" if is_replaced else self.trouble
-        emit(_LOG, logging.INFO if is_replaced else logging.WARNING, "inverter.soc", text)
+        emit(_LOG.info if is_replaced else _LOG.warning, "inverter.soc", text)
 
     def _run(self) -> None:
         try:
@@ -169,7 +169,7 @@ class Gateway(Output):
                 self.trouble = (
                     f"the inverter gets no frames any more: {error!r}; restart the service"
                 )
-                emit(_LOG, logging.ERROR, "inverter.failed", self.trouble)
+                emit(_LOG.error, "inverter.failed", self.trouble)
 
     def _hand_on_pending(self) -> None:
         """Hand on what has come in both directions."""
@@ -193,7 +193,7 @@ class Gateway(Output):
         if has_other_clock or time.time() - frame.timestamp <= DOUBT_S:
             return True
         text = f"frames of {bus.name} that had waited longer than {DOUBT_S} s are dropped"
-        emit(_LOG, logging.WARNING, "inverter.late", text)
+        emit(_LOG.warning, "inverter.late", text)
         return False
 
     def _hand_on(self, frame: can.Message, bus: ReconnectingBus) -> None:
@@ -205,7 +205,7 @@ class Gateway(Output):
         if bus not in self._without_fd:
             self._without_fd.append(bus)
             text = f"{bus.name} is not open for CAN FD: frames such as 0x{frame.arbitration_id:X}"
-            emit(_LOG, logging.WARNING, "inverter.no_fd", f"{text} are dropped")
+            emit(_LOG.warning, "inverter.no_fd", f"{text} are dropped")
 
 
 def output_of(_config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Gateway]:
@@ -234,5 +234,5 @@ def make_output(service: Service) -> Gateway:
         )
 
     text = f"frames are handed on between {battery.name} and the inverter on {inverter.name}"
-    emit(_LOG, logging.INFO, "inverter.ready", text, profile=config.profile)
+    emit(_LOG.info, "inverter.ready", text, profile=config.profile)
     return Gateway(battery, inverter, soc_fields(config.profile), own_ids)

@@ -163,12 +163,12 @@ class LiveJudge(Output):
         text = "second opinion on the battery's own SoC: " + result["text"].replace("\n", " ")
         is_off = result["now"]["verdict"] == "off"
         self.trouble = text if is_off else ""
-        emit(_LOG, logging.WARNING if is_off else logging.INFO, "judge.result", text)
+        emit(_LOG.warning if is_off else _LOG.info, "judge.result", text)
 
 
 def _failed(error: Exception) -> None:
     text = f"the battery's own SoC was not judged: {error}"
-    emit(_LOG, logging.WARNING, "judge.failed", text)
+    emit(_LOG.warning, "judge.failed", text)
 
 
 def output_of(config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJudge]:

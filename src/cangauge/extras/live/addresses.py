@@ -219,7 +219,7 @@ def _read_secret(path: str | PathLike[str], event: str, kind: str, key: str) -> 
         data = file.read(LONGEST_TOKEN + 2)
     if rights & (stat.S_IROTH | stat.S_IWOTH):
         text = f"{path}: every user of this machine can read or change this {kind}: chmod 600 it"
-        emit(_LOG, logging.WARNING, event, text, path=str(path))
+        emit(_LOG.warning, event, text, path=str(path))
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:

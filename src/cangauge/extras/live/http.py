@@ -111,7 +111,7 @@ class Site(Output):
         port = listening.getsockname()[1]
         access = "without a token" if self.token is None else "with a token"
         text = f"{title.format(replace(address, port=port))}, {access}"
-        emit(_LOG, logging.INFO, f"{address.key}.listening", text, port=port)
+        emit(_LOG.info, f"{address.key}.listening", text, port=port)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
@@ -192,7 +192,7 @@ class Handler(RequestHandler):
             self.set_header("WWW-Authenticate", "Bearer")
             self.refuse(401, "a bearer token is required")
             text = f"refused {self.request.remote_ip}: missing or wrong token"
-            emit(_LOG, logging.WARNING, "http.refused", text, remote=self.request.remote_ip)
+            emit(_LOG.warning, "http.refused", text, remote=self.request.remote_ip)
 
     def has_token(self) -> bool:
         """Return whether the request bears the token or the cookie, where they are needed."""

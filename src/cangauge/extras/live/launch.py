@@ -65,7 +65,7 @@ class Live(Output):
                 " continues. Restart the service, or serve them by a unit of their own:"
                 ' live = "unit", and `cangauge live CONFIG`'
             )
-            emit(_LOG, logging.WARNING, "live.ended", self.trouble, exit_code=code)
+            emit(_LOG.warning, "live.ended", self.trouble, exit_code=code)
 
     def close(self) -> None:
         """End the child."""

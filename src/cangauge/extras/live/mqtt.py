@@ -96,7 +96,7 @@ class MqttPublisher(Output):
             client.tls_set_context(context)
         elif password is not None and not is_loopback_name(config.broker):
             text = f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]"
-            emit(_LOG, logging.WARNING, "mqtt.unencrypted", text)
+            emit(_LOG.warning, "mqtt.unencrypted", text)
         client.on_log = self._on_log
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
@@ -171,7 +171,7 @@ class MqttPublisher(Output):
         # paho reports a message of QoS 2 before its release in its log only.
         connection = client.socket()
         if text.startswith("Received PUBLISH") and isinstance(connection, socket.socket):
-            self._emit(logging.WARNING, "mqtt.flooded", "it sent a message without a subscription")
+            self._emit(_LOG.warning, "mqtt.flooded", "it sent a message without a subscription")
             with suppress(OSError):  # the broker has closed it
                 connection.shutdown(socket.SHUT_RDWR)
 
@@ -179,21 +179,21 @@ class MqttPublisher(Output):
         self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
     ) -> None:
         if reason.is_failure:
-            self._emit(logging.WARNING, "mqtt.refused", f"refused the connection: {reason}")
+            self._emit(_LOG.warning, "mqtt.refused", f"refused the connection: {reason}")
             return
         self._is_new = True
-        self._emit(logging.INFO, "mqtt.connected", "connected")
+        self._emit(_LOG.info, "mqtt.connected", "connected")
 
     def _on_disconnect(
         self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
     ) -> None:
         if not self._is_closed:
             text = f"connection lost ({reason}); the estimate continues"
-            self._emit(logging.WARNING, "mqtt.lost", text)
+            self._emit(_LOG.warning, "mqtt.lost", text)
 
     def _on_connect_fail(self, _client: Client, _userdata: object) -> None:
         text = f"not reachable; tried again after at most {RETRY_S[1]} s"
-        self._emit(logging.WARNING, "mqtt.unreachable", text)
+        self._emit(_LOG.warning, "mqtt.unreachable", text)
 
-    def _emit(self, level: int, event: str, text: str) -> None:
-        emit(_LOG, level, event, f"MQTT broker {self._place}: {text}")
+    def _emit(self, log: Any, event: str, text: str) -> None:
+        emit(log, event, f"MQTT broker {self._place}: {text}")

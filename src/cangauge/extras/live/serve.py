@@ -102,7 +102,7 @@ async def _serve(endpoint: Path, config: RunConfig, bus: str) -> None:
             except NotRunningError:
                 # One that hangs shows as one whose latest status grows old.
                 if not await asyncio.to_thread(is_served, endpoint):
-                    emit(_LOG, logging.INFO, "live.ended", f"the service at {endpoint} has ended")
+                    emit(_LOG.info, "live.ended", f"the service at {endpoint} has ended")
                     return
             else:
                 snapshot = Snapshot(time.monotonic(), status)
@@ -122,7 +122,7 @@ def main() -> None:
         try:
             serve(Path(config.status_socket), config)
         except (CangaugeError, RuntimeError) as error:  # RuntimeError: no thread can be started
-            emit(_LOG, logging.ERROR, "live.failed", str(error))
+            emit(_LOG.error, "live.failed", str(error))
             sys.exit(1)
 
 
