@@ -52,5 +52,6 @@ def _import(package: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:
-        cure = f"install it: pip install {package}"
-        raise InputError(f"{package} is not installed", cure=cure) from error
+        raise InputError(
+            f"{package} is not installed", cure=f"install it: pip install {package}"
+        ) from error

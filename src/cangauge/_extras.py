@@ -40,5 +40,8 @@ def require_extra(name: str, field: str | None = None) -> None:
     """
     package = _PACKAGES[name]
     if find_spec(package) is None:
-        cure = f"pip install 'cangauge[{name}]'"
-        raise InputError(f"needs {package}, which is not installed", field=field, cure=cure)
+        raise InputError(
+            f"needs {package}, which is not installed",
+            field=field,
+            cure=f"pip install 'cangauge[{name}]'",
+        )

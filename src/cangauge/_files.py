@@ -97,8 +97,11 @@ def _unreadable(error: OSError | ValueError, path: str | PathLike[str]) -> Input
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return InputError("no such file", source=path, cure="check the path")
     reason = getattr(error, "strerror", None) or str(error)
-    cure = "change its rights" if isinstance(error, PermissionError) else "check the path"
-    return InputError(f"cannot be read: {reason}", source=path, cure=cure)
+    return InputError(
+        f"cannot be read: {reason}",
+        source=path,
+        cure="change its rights" if isinstance(error, PermissionError) else "check the path",
+    )
 
 
 def open_unpacked(path: str | PathLike[str]) -> io.BufferedReader:
@@ -178,9 +181,11 @@ def _bzip2_bytes(path: str | PathLike[str]) -> int:
 
 def _too_large(path: str | PathLike[str], limit: int, what: str) -> InputError:
     size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
-    problem = f"larger than the {size} that {what} may have"
-    cure = "check that this is the right file, and that it is whole; or split it"
-    return InputError(problem, source=path, cure=cure)
+    return InputError(
+        f"larger than the {size} that {what} may have",
+        source=path,
+        cure="check that this is the right file, and that it is whole; or split it",
+    )
 
 
 def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
@@ -398,14 +403,16 @@ def atomic_path(path: str | PathLike[str], rights: int = 0o666) -> Iterator[Path
             _sync(descriptor, target)
             info = os.fstat(descriptor)
         if not has_name(info, part):
-            problem, cure = "another user has exchanged it meanwhile", "name another folder"
-            raise InputError(problem, source=path, cure=cure)
+            raise InputError(
+                "another user has exchanged it meanwhile",
+                source=path,
+                cure="name another folder",
+            )
         part.replace(target)
     except OSError as error:
         if error.errno not in FULL:
             raise
-        problem = f"{path}: writing failed: {error.strerror}; free some space"
-        raise CangaugeError(problem) from error
+        raise CangaugeError(f"{path}: writing failed: {error.strerror}; free some space") from error
     finally:
         with suppress(OSError):
             part.unlink()
@@ -442,8 +449,11 @@ def written_name(path: str | PathLike[str]) -> Path:
         if not _is_trusted(name, is_folder=bool(left)):
             if not left:
                 return name
-            problem, cure = f"{name} is a link of another user", "name the folder itself"
-            raise InputError(problem, source=path, cure=cure)
+            raise InputError(
+                f"{name} is a link of another user",
+                source=path,
+                cure="name the folder itself",
+            )
         links += 1
         if links > LINKS_AT_MOST:
             return Path(path).absolute()

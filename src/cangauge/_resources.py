@@ -29,5 +29,8 @@ def shared_file(folder: str, name: str) -> Path:
         path = root / folder / name
         if path.is_file():
             return path
-    problem = "this file of the installation is missing"
-    raise InputError(problem, source=f"{folder}/{name}", cure="reinstall cangauge")
+    raise InputError(
+        "this file of the installation is missing",
+        source=f"{folder}/{name}",
+        cure="reinstall cangauge",
+    )

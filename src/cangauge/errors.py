@@ -153,8 +153,12 @@ def require_choice(value: object, choices: Iterable[object], field: str) -> None
     """Raise InputError if a value is none of some; `field` is its argument."""
     known = list(choices)
     if value not in known:
-        cure = f"use one of: {', '.join(map(str, known))}"
-        raise InputError("not a known value", field=field, value=value, cure=cure)
+        raise InputError(
+            "not a known value",
+            field=field,
+            value=value,
+            cure=f"use one of: {', '.join(map(str, known))}",
+        )
 
 
 def require_number(value: object, field: str) -> None:
@@ -174,8 +178,11 @@ def require_temperature(value_c: float | None) -> None:
         return
     require_number(value_c, "--temperature")
     if not COLDEST_C <= value_c <= HOTTEST_C:
-        problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-        raise InputError(problem, field="--temperature", value=value_c)
+        raise InputError(
+            f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C",
+            field="--temperature",
+            value=value_c,
+        )
 
 
 # Text quoted from a file may have any length [characters].

@@ -280,6 +280,7 @@ class FrameIds:
         names: dict[int, str] = {}
         for name, value in vars(self).items():
             if value in names:
-                problem = f"{names[value]} has the same id"
-                raise InputError(problem, field=f"ids.{name}", value=f"0x{value:X}")
+                raise InputError(
+                    f"{names[value]} has the same id", field=f"ids.{name}", value=f"0x{value:X}"
+                )
             names[value] = name

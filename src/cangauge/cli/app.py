@@ -152,8 +152,8 @@ def main() -> None:
     except Exception as error:
         # Of a library that is loaded: the words of the C library's loader.
         if isinstance(error, MemoryError) or "failed to map segment" in str(error):
-            problem, cure = "the memory limit is reached", "raise it (ulimit -v, MemoryMax=)"
-            sys.exit(_failed(f"{problem}; {cure}", CangaugeError(problem).to_dict(), 1))
+            line = "the memory limit is reached; raise it (ulimit -v, MemoryMax=)"
+            sys.exit(_failed(line, CangaugeError(line).to_dict(), 1))
         # A bug: Python prints the traceback and exits with 1.
         _failed("", CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise

@@ -73,8 +73,12 @@ def demo_command(
     try:
         make_folder(folder)
     except OSError as error:
-        problem, cure = f"cannot create this folder: {error.strerror}", "name another one"
-        raise InputError(problem, source=folder, field="--folder", cure=cure) from error
+        raise InputError(
+            f"cannot create this folder: {error.strerror}",
+            source=folder,
+            field="--folder",
+            cure="name another one",
+        ) from error
     files = {"model": "model.json", "fit_page": "fit.html", "soc_page": "soc.html"}
     paths = {name: folder / file for name, file in files.items()}
     note("1/4  fit the voltage model to 2.6 h of the reconstructed Leaf test")
@@ -127,7 +131,6 @@ def _play(folder: Path, log: Path) -> float:
     cangauge = [sys.executable, "-P", "-m", "cangauge"]  # -P: no modules of the working folder
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     service = [*cangauge, "run", "--config", str(config)]
-    require_extra("report")
     began = time.monotonic()
     with subprocess.Popen(  # noqa: S603 - our own commands
         service, stderr=subprocess.PIPE, text=True, env=environment

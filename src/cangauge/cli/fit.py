@@ -233,9 +233,12 @@ def _delays_s(given: str) -> tuple[float, ...]:
     # Slope resistance and heat are defined by the undelayed current.
     if delays[:1] == (0.0,) and all(low < high <= 3600.0 for low, high in pairwise(delays)):
         return delays
-    problem = "not delays that begin with 0 and increase to 3600 s at most"
-    cure = "give increasing seconds from 0, such as 0,10,30,70"
-    raise InputError(problem, field="--delays", value=given, cure=cure)
+    raise InputError(
+        "not delays that begin with 0 and increase to 3600 s at most",
+        field="--delays",
+        value=given,
+        cure="give increasing seconds from 0, such as 0,10,30,70",
+    )
 
 
 def _show(result: Identification) -> None:

@@ -272,19 +272,21 @@ def _column_of(log: Log, heading: str, reading: ReadingOptions) -> FloatArray:
 def load_function(text: str) -> Callable[..., Any]:
     """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
-    cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
     sys.path.insert(0, "")  # modules of the working directory too
     try:
         is_file = place.endswith(".py")
         names = run_path(place) if is_file else vars(importlib.import_module(place))
+        if not callable(function := names.get(name)):
+            raise ImportError(f"{place} has no function {name}")  # noqa: TRY004, TRY301 - as below
     except (Exception, SystemExit) as error:
-        problem = f"cannot be imported: {type(error).__name__}: {error}"
-        raise InputError(problem, field="--simulator", value=text, cure=cure) from error
+        raise InputError(
+            f"cannot be imported: {type(error).__name__}: {error}",
+            field="--simulator",
+            value=text,
+            cure="give MODULE:FUNCTION or path/to/file.py:FUNCTION",
+        ) from error
     finally:
         sys.path.remove("")
-    if not callable(function := names.get(name)):
-        problem = f"{place} has no function {name}"
-        raise InputError(problem, field="--simulator", value=text, cure=cure)
     return function  # type: ignore[no-any-return]
 
 

@@ -94,9 +94,13 @@ def inspect_command(
             write_texts_atomic({report: page.html()})
             note(f"report: {report}")
     elif report is not None:
-        cure = "omit it, or use cangauge estimate --report"
-        problem = "shows a log, and this is a capture"
-        raise InputError(problem, source=path, field="--report", value=str(report), cure=cure)
+        raise InputError(
+            "shows a log, and this is a capture",
+            source=path,
+            field="--report",
+            value=str(report),
+            cure="omit it, or use cangauge estimate --report",
+        )
     else:
         of_capture = inspect_capture(path, reading.car() if reading.names_vehicle else None)
         found, show = of_capture.to_dict(), partial(_show_capture, of_capture)

@@ -84,8 +84,11 @@ def option(
             return value
         number = value if isinstance(value, int | float) else _number(value, field, words, unit)
         if within is not None and not within[0] <= number <= within[1]:  # NaN too
-            problem = f"must lie within {within[0]:g} … {within[1]:g} {unit}".rstrip()
-            raise InputError(problem, field=field, value=number)
+            raise InputError(
+                f"must lie within {within[0]:g} … {within[1]:g} {unit}".rstrip(),
+                field=field,
+                value=number,
+            )
         return number
 
     if within is not None:
@@ -101,9 +104,13 @@ def _number(text: str, field: str, words: Sequence[str], unit: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        word, of = " or ".join(words), f" of {unit}" if unit else ""
-        problem, cure = f"neither a number nor {word}", f"give a number{of}, or {word}"
-        raise InputError(problem, field=field, value=text, cure=cure) from error
+        word = " or ".join(words)
+        raise InputError(
+            f"neither a number nor {word}",
+            field=field,
+            value=text,
+            cure=f"give a number{f' of {unit}' if unit else ''}, or {word}",
+        ) from error
 
 
 MODEL: Final = option("-m, --model", "MODEL", "Model file of `cangauge fit`.")
@@ -338,8 +345,10 @@ def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float 
         if 0.0 < initial_soc_pct <= 1.0:
             doubts.append(f"a fraction is given in percent, as {100.0 * initial_soc_pct:g}")
         if doubts:
-            stated = f"{log.name}: the initial SoC is {initial_soc_pct:g} % as given"
-            remark(f"warning: {stated}; {', and '.join(doubts)}")
+            remark(
+                f"warning: {log.name}: the initial SoC is {initial_soc_pct:g} % as given;"
+                f" {', and '.join(doubts)}"
+            )
 
 
 def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:
@@ -357,12 +366,14 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
     for output in filter(None, outputs):
         place = written_name(output)
         if place in read:
-            problem, cure = "this output is also an input", "name another file for it"
-            raise InputError(problem, source=output, cure=cure)
+            raise InputError(
+                "this output is also an input", source=output, cure="name another file for it"
+            )
         # /dev/null may be named twice.
         if place in written and (place.is_file() or not place.exists()):
-            problem, cure = "two outputs have this name", "name two different files"
-            raise InputError(problem, source=output, cure=cure)
+            raise InputError(
+                "two outputs have this name", source=output, cure="name two different files"
+            )
         written.add(place)
         check_writable(output)
 
