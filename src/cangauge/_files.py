@@ -49,23 +49,8 @@ _BZIP2_BLOCK: Final = _at_any_bit(0x314159265359)
 _BZIP2_END: Final = _at_any_bit(0x177245385090)
 _UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
 _D3_MEMBER: Final = "test data.txt"
-_SUFFIXES: Final = frozenset(
-    f".{suffix}"
-    for suffix in (
-        "gz",
-        "bz2",
-        "zip",
-        "csv",
-        "txt",
-        "tsv",
-        "parquet",
-        "pq",
-        "dat",
-        "xlsx",
-        "mpt",
-        "bdf",
-        "mf4",
-    )
+_SUFFIXES: Final = re.compile(
+    r"(?<=.)(\.(gz|bz2|zip|csv|txt|tsv|parquet|pq|dat|xlsx|mpt|bdf|mf4))+\Z", re.IGNORECASE
 )
 
 
@@ -350,9 +335,7 @@ def _lines(data: bytes) -> tuple[str, ...]:
 
 
 def _stem(name: str) -> str:
-    while (suffix := Path(name).suffix.lower()) in _SUFFIXES:
-        name = name[: -len(suffix)]
-    return name.removesuffix(" Test Data")
+    return _SUFFIXES.sub("", name).removesuffix(" Test Data")
 
 
 # --- Writing

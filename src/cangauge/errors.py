@@ -106,7 +106,7 @@ def located(source: str | PathLike[str] | None, field: str = "") -> Iterator[Non
         ) from error
 
 
-_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)(?: (from-soc)|( (?=['\d])))?")
+_OPTION: Final = re.compile("--([a-z]+(?:-[a-z]+)*)")
 _ARGUMENTS: Final = {
     "temperature": "temperature_c",
     "initial-soc": "initial_soc_pct",
@@ -122,14 +122,11 @@ _ARGUMENTS: Final = {
 def naming_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Let the errors of a function of Python name its arguments in place of the options."""
 
-    def named(text: str | None) -> str | None:
-        def argument(match: re.Match[str]) -> str:
-            name = _ARGUMENTS.get(match[1], match[1].replace("-", "_"))
-            if match[2]:
-                return f'{name}="{match[2]}"'
-            return f"{name}=" if match[3] else name
+    def argument(option: re.Match[str]) -> str:
+        return _ARGUMENTS.get(option[1], option[1].replace("-", "_"))
 
-        return None if text is None else _OPTION.sub(argument, text)
+    def named(text: str | None) -> str | None:
+        return text and _OPTION.sub(argument, text)
 
     @wraps(function)
     def call(*arguments: P.args, **options: P.kwargs) -> T:

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from cangauge._typing import FloatArray
     from cangauge.estimation.offline import EstimateTable
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
     from cangauge.service.offline import RecordedEstimate
 
@@ -168,6 +167,7 @@ def estimate_file(
     keeps_pack: bool = False,
 ) -> RecordedEstimate:
     """Estimate a log or capture as the command does; InputError for what the command refuses."""
+    from cangauge.logs.charge import refuse_contradictions
     from cangauge.logs.read import LogFile
     from cangauge.service.offline import estimate_capture, estimate_recorded_log
 
@@ -182,7 +182,11 @@ def estimate_file(
                 path, car, model, settings, keeps_pack=keeps_pack, progress=show
             )
         else:
-            log = _load(path, model, settings, reading, soc_from_log=soc_from_log)
+            log, capacity_ah = reading.load(path), settings.capacity_ah or model.capacity_ah
+            if soc_from_log:  # a stated start needs no SoC of the log
+                refuse_contradictions([log], capacity_ah)
+            if settings.initial_soc_pct is not None:
+                note_starts([log], settings.initial_soc_pct, capacity_ah)
             done = estimate_recorded_log(
                 log,
                 model,
@@ -194,25 +198,6 @@ def estimate_file(
             )
     _check(done)
     return done
-
-
-def _load(
-    path: Path,
-    model: Model,
-    settings: EstimatorSettings,
-    reading: ReadingOptions,
-    *,
-    soc_from_log: bool,
-) -> Log:
-    """Return a log; InputError if its charge contradicts a SoC that it has to start from."""
-    from cangauge.logs.charge import refuse_contradictions
-
-    log, capacity_ah = reading.load(path), settings.capacity_ah or model.capacity_ah
-    if soc_from_log:  # a stated start needs no SoC of the log
-        refuse_contradictions([log], capacity_ah)
-    if settings.initial_soc_pct is not None:
-        note_starts([log], settings.initial_soc_pct, capacity_ah)
-    return log
 
 
 def _check(done: RecordedEstimate) -> None:

@@ -146,7 +146,7 @@ Json = Annotated[
 
 
 def command(
-    *omitted: str, keys: Callable[[], list[inspect.Parameter]] | None = None
+    *omitted: str, keys: Iterable[inspect.Parameter] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return the decorator of a command with options that several commands share.
 
@@ -157,8 +157,8 @@ def command(
     ----------
     *omitted : str
         Fields that are no options of this command, but keep their defaults.
-    keys : callable, optional
-        Returns the parameters that `**options` stands for.
+    keys : iterable of inspect.Parameter
+        The parameters that `**options` stands for.
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -167,7 +167,7 @@ def command(
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
             kind = parameter.annotation
             if parameter.kind is parameter.VAR_KEYWORD:
-                made += [] if keys is None else keys()
+                made += keys
             elif isinstance(kind, type) and is_dataclass(kind):
                 fields = inspect.signature(kind, eval_str=True).parameters.values()
                 shared = [field for field in fields if field.name not in omitted]
@@ -389,11 +389,8 @@ def config_parameters(*names: str) -> list[inspect.Parameter]:
     for name, key in config_keys().items():
         if "option" not in key or (names and name not in names):
             continue
-        kind: Any = Path if key.get("is_path") else float if key.get("type") == "number" else str
-        if name == "bus_options":
-            kind = list[str]
-        elif name == "initial_soc":  # "auto" is no number: checked by the configuration
-            kind = str
+        # Texts, which the configuration checks: a number may be the word auto.
+        kind: Any = list[str] if name == "bus_options" else str
         first, dot, more = key["description"].partition(". ")
         unit = f" [{key['unit']}]" if "unit" in key else ""
         text = f"{first.removesuffix('.')}{unit}.{dot[1:]}{more}"
@@ -410,5 +407,4 @@ def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return given options as keys of a configuration; InputError if a bus option is wrong."""
     from cangauge.bus.open import parse_bus_options
 
-    values = {name: str(v) if isinstance(v, Path) else v for name, v in options.items()}
-    return values | {"bus_options": parse_bus_options(options["bus_options"] or [])}
+    return {**options, "bus_options": parse_bus_options(options["bus_options"] or [])}

@@ -27,19 +27,11 @@ if TYPE_CHECKING:
     from cangauge.replay.player import ReplayState
     from cangauge.replay.steps import Source
     from cangauge.service.config import RunConfig
-    from cangauge.settings import FrameIds
 
 
 @command(
-    keys=partial(
-        config_parameters,
-        "interface",
-        "channel",
-        "bus_options",
-        "vehicle",
-        "dbc",
-        "map",
-        "temperature",
+    keys=config_parameters(
+        "interface", "channel", "bus_options", "vehicle", "dbc", "map", "temperature"
     )
 )
 def replay_command(
@@ -102,8 +94,7 @@ def replay_command(
     from cangauge.service.setup import address_of
 
     loaded = load_config(config, {"model": "-", **config_values(options)})
-    ids = loaded.ids
-    source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
+    ids, source, address = loaded.ids, _source(recorded, columns, loaded), address_of(loaded)
     stopped: list[bool] = []
     factor = math.inf if speed == "max" else speed
     with ExitStack() as stack:
@@ -129,7 +120,7 @@ def replay_command(
         raise KeyboardInterrupt
 
 
-def _source(recorded: Path, columns: str | None, config: RunConfig, ids: FrameIds) -> Source:
+def _source(recorded: Path, columns: str | None, config: RunConfig) -> Source:
     from cangauge.logs.read import LogFile
     from cangauge.replay.steps import CaptureSource, LogSource
     from cangauge.service.setup import load_vehicle
@@ -139,7 +130,7 @@ def _source(recorded: Path, columns: str | None, config: RunConfig, ids: FrameId
     recording = reading.open(recorded)
     if not isinstance(recording, LogFile):
         is_named = (config.vehicle, config.dbc, config.map) != (None, None, None)
-        return CaptureSource(recorded, load_vehicle(config) if is_named else None, ids)
+        return CaptureSource(recorded, load_vehicle(config) if is_named else None, config.ids)
     log = recording.read(temperature_c=config.temperature)
     note_reading(log)
     return LogSource(log, load_vehicle(config))

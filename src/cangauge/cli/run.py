@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 
-@command(keys=config_parameters)
+@command(keys=config_parameters())
 def run_command(
     *,
     config: Annotated[

@@ -76,30 +76,29 @@ def status_command(
         no_status,
     )
 
-    def ask() -> tuple[str, dict[str, Any]]:
+    def ask() -> tuple[dict[str, Any], str, Text, dict[str, str]]:
         place = endpoint or find_socket()
         status = fetch_status(place)
         try:
-            live_text(status), status_values(status)
+            return status, f"cangauge at {place}", live_text(status), status_values(status)
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise no_status(place) from error
-        return f"cangauge at {place}", status
 
     if watch:
         _watch(ask)
     try:
-        title, status = ask()
+        status, title, _, values = ask()
     except NotRunningError as error:
         if json_output:
             emit_json({"running": False, "status": None, "problem": str(error)})
             raise typer.Exit(1) from error
         raise CangaugeError(str(error)) from error
-    finish(status, partial(print_values, title, status_values(status)), as_json=json_output)
+    finish(status, partial(print_values, title, values), as_json=json_output)
     if status["status"] not in {"valid", "degraded"}:
         raise typer.Exit(1)
 
 
-def _watch(ask: Callable[[], tuple[str, dict[str, Any]]]) -> NoReturn:
+def _watch(ask: Callable[[], tuple[object, str, Text, dict[str, str]]]) -> NoReturn:
     """Show the status until stopped, in lines where stdout is no terminal."""
     shown = PlainConsole(highlight=False)
     with ExitStack() as stack:
@@ -110,10 +109,9 @@ def _watch(ask: Callable[[], tuple[str, dict[str, Any]]]) -> NoReturn:
         while True:
             content: RenderableType
             try:
-                title, status = ask()
-                content = live_text(status)
+                _, title, content, values = ask()
                 if shown.is_terminal:
-                    content = text_table(title, ("", ""), known_rows(status_values(status)))
+                    content = text_table(title, ("", ""), known_rows(values))
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:

@@ -39,7 +39,7 @@ _SCALE_CURES: Final = {
 }
 
 
-@command(keys=partial(config_parameters, *_BUS))
+@command(keys=config_parameters(*_BUS))
 def init_command(
     captures: Annotated[
         list[Path] | None, argument("[CAPTURE]…", "Captures of one car, of a drive.")
