@@ -74,11 +74,15 @@ def schema_error(
     place = list(first["loc"])
     while len(place) > 1 and place[-1] in _UNION_TAGS:  # pydantic names the member of a union
         place.pop()
-    problem, value = first["msg"], first["input"]
+    problem = first["msg"]
+    value = first["input"]
     if first["type"] == "missing":
-        problem, value, cure = "is missing", None, cure or "add it"
+        problem = "is missing"
+        value = None
+        cure = cure or "add it"
     elif first["type"] in _UNKNOWN_KEY:
-        problem, value = "unknown key", None
+        problem = "unknown key"
+        value = None
         keys = _known_keys(model, place[:-1])
         near = closest(str(place[-1]), keys)
         cure = f"did you mean {near}?" if near else f"known are {', '.join(sorted(keys))}"

@@ -37,7 +37,9 @@ _HEAD_LINES: Final = 160
 # --- Reading
 
 _DAMAGE: Final = (EOFError, OSError, ValueError, zlib.error, zipfile.BadZipFile)
-_GZIP, _BZIP2, _ZIP = b"\x1f\x8b", b"BZh", b"PK\x03\x04"
+_GZIP = b"\x1f\x8b"
+_BZIP2 = b"BZh"
+_ZIP = b"PK\x03\x04"
 
 
 def _at_any_bit(mark: int) -> list[bytes]:
@@ -494,7 +496,8 @@ def _create_beside(
 
 def _is_kept_by_another(name: Path) -> bool:
     """Return whether a file cannot be replaced: another user's in a folder such as /tmp."""
-    info, folder = name.lstat(), name.parent.stat()
+    info = name.lstat()
+    folder = name.parent.stat()
     is_sticky = bool(folder.st_mode & stat.S_ISVTX)
     return is_sticky and os.geteuid() not in {0, info.st_uid, folder.st_uid}
 
@@ -509,7 +512,8 @@ def _sync(written: int, target: Path) -> None:
 
 def is_device(path: Path) -> bool:
     try:
-        info, target = path.lstat(), path.stat()
+        info = path.lstat()
+        target = path.stat()
     except (OSError, ValueError):  # absent, or an impossible path: creating it reports which
         return False
     if not is_own(info) and not stat.S_ISCHR(info.st_mode):  # a planted link or pipe

@@ -244,7 +244,8 @@ class PackLimits:
 
     def __post_init__(self) -> None:
         check_settings(self, "limits")
-        low, high_v = self.min_voltage_v, self.max_voltage_v
+        low = self.min_voltage_v
+        high_v = self.max_voltage_v
         if low is not None and high_v is not None and low >= high_v:
             raise InputError(
                 "is not below limits.max_voltage_v", field="limits.min_voltage_v", value=low

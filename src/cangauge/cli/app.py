@@ -188,7 +188,8 @@ def _discard_stdout() -> None:
 
 def _usage(error: Any) -> tuple[str, str | None]:
     """Return a usage error in one line, "" if the help page was shown, and its option."""
-    field, parameter = getattr(error, "option_name", None), getattr(error, "param", None)
+    field = getattr(error, "option_name", None)
+    parameter = getattr(error, "param", None)
     if field is None and parameter is not None:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"

@@ -94,7 +94,8 @@ def demo_command(
         old.unlink()
     seconds = _play(folder, folder / PLAYED)
     note("3/4  compare live with offline and with the reference")
-    settings, vehicle = EstimatorSettings(temperature_source="room"), Vehicle.load("generic")
+    settings = EstimatorSettings(temperature_source="room")
+    vehicle = Vehicle.load("generic")
     # The recording gives the live numbers again, bit for bit.
     table = estimate_capture(folder / "live.log", vehicle, model, settings).table
     live = score(table, log, seconds)

@@ -182,7 +182,8 @@ def estimate_file(
                 path, car, model, settings, keeps_pack=keeps_pack, progress=show
             )
         else:
-            log, capacity_ah = reading.load(path), settings.capacity_ah or model.capacity_ah
+            log = reading.load(path)
+            capacity_ah = settings.capacity_ah or model.capacity_ah
             if soc_from_log:  # a stated start needs no SoC of the log
                 refuse_contradictions([log], capacity_ah)
             if settings.initial_soc_pct is not None:
@@ -207,7 +208,8 @@ def _check(done: RecordedEstimate) -> None:
     from cangauge.logs.sign import require_discharge_positive
     from cangauge.settings import GAP_S
 
-    recorded, gap_s = done.recorded, done.settings.gap_s
+    recorded = done.recorded
+    gap_s = done.settings.gap_s
     if isinstance(recorded, CaptureSamples):
         refuse_single_row(recorded)
         for text in recorded.remarks:
@@ -253,7 +255,8 @@ def _show(name: str, found: Mapping[str, Any], table: EstimateTable) -> None:
         return uncertain(float(table.soc_pct[row]), float(table.soc_std_pct[row]), "%")
 
     known = np.isfinite(table.soc_pct)
-    start, origin = number(found["initial_soc_pct"], 1, "%"), found["initial_soc_from"]
+    start = number(found["initial_soc_pct"], 1, "%")
+    origin = found["initial_soc_from"]
     if origin == "voltage" and known.any():
         start = soc_at(int(known.argmax()))
     shares = [

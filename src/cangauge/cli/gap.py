@@ -144,7 +144,8 @@ def gap_command(
     """
     from cangauge.diagnosis import diagnose
 
-    tests, healthy = add_test or [], reference or []
+    tests = add_test or []
+    healthy = reference or []
     given = _model_of(model, capacity_ah)
     check_outputs([report, extended], filter(None, [*logs, *tests, *healthy, model]))
     with progress("cangauge.diagnosis") as show:
@@ -153,7 +154,8 @@ def gap_command(
             capacity_ah = given.capacity_ah
             _note_differences(read, capacity_ah)
         own = _started(read[: len(logs)], initial_soc, capacity_ah)
-        added, references = read[len(logs) :][: len(tests)], read[len(logs) + len(tests) :]
+        added = read[len(logs) :][: len(tests)]
+        references = read[len(logs) + len(tests) :]
         found = diagnose(
             [*own, *added],
             given,

@@ -81,14 +81,16 @@ def inspect_command(
     from cangauge.logs.read import LogFile
 
     check_outputs([report], [path])
-    recording, logs = reading.open(path), []
+    recording = reading.open(path)
+    logs = []
     if isinstance(recording, LogFile):
         reading.note_log(path)
         logs = [log := recording.read(temperature_c=reading.temperature)]
         if log.assumed:
             remark(f"{path}: read as {', '.join(log.assumed)}")
         of_log = inspect_log(log)
-        found, show = of_log.to_dict(), partial(_show_log, of_log)
+        found = of_log.to_dict()
+        show = partial(_show_log, of_log)
         if report is not None:
             page = extra("report.inspection:inspect_page")(of_log, log)
             write_texts_atomic({report: page.html()})
@@ -103,14 +105,17 @@ def inspect_command(
         )
     else:
         of_capture = inspect_capture(path, reading.car() if reading.names_vehicle else None)
-        found, show = of_capture.to_dict(), partial(_show_capture, of_capture)
+        found = of_capture.to_dict()
+        show = partial(_show_capture, of_capture)
     finish(found | {"assumed": assumed_of(logs)}, show, as_json=json_output)
 
 
 def _show_log(found: LogInspection) -> None:
     from cangauge.inspect.log import ability_rows, channel_rows
 
-    timing, charge, soc = found.timing, found.charge, found.soc
+    timing = found.timing
+    charge = found.charge
+    soc = found.soc
     rate = "no rate"
     if timing.rate_hz:
         exact = f"{timing.rate_hz:.4g} Hz (regular)"
@@ -138,7 +143,8 @@ def _show_log(found: LogInspection) -> None:
 
 def _show_capture(found: CaptureInspection) -> None:
     """Print the frames, the vehicle and the faults of a capture; what is zero is left out."""
-    info, begins = found.info, ""
+    info = found.info
+    begins = ""
     if found.start_s > _STAMPS_SINCE_1970_S:
         begins = f", from {datetime.fromtimestamp(found.start_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
     say(

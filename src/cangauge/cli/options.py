@@ -279,7 +279,8 @@ class ReadingOptions:
         from cangauge.logs.read import LogFile
         from cangauge.logs.sign import require_discharge_positive
 
-        recording, car = self.open(path), None
+        recording = self.open(path)
+        car = None
         if isinstance(recording, LogFile):
             self.note_log(path)
             recording = replace(recording, read_besides=tuple(used))

@@ -94,7 +94,9 @@ def replay_command(
     from cangauge.service.setup import address_of
 
     loaded = load_config(config, {"model": "-", **config_values(options)})
-    ids, source, address = loaded.ids, _source(recorded, columns, loaded), address_of(loaded)
+    ids = loaded.ids
+    source = _source(recorded, columns, loaded)
+    address = address_of(loaded)
     stopped: list[bool] = []
     factor = math.inf if speed == "max" else speed
     with ExitStack() as stack:

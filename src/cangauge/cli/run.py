@@ -126,7 +126,8 @@ def check_command(
     from cangauge.service.run import Service
 
     service = Service(config)
-    pipeline, ids = service.pipeline, service.pipeline.settings.ids
+    pipeline = service.pipeline
+    ids = service.pipeline.settings.ids
     found = {
         "bus": service.bus,
         "vehicle": pipeline.vehicle.name,

@@ -122,7 +122,9 @@ def _watch(ask: Callable[[], tuple[object, str, Text, dict[str, str]]]) -> NoRet
 
 def live_text(status: dict[str, Any]) -> Text:
     """Return SoC ± standard deviation, status, voltage, residual and rate in one line."""
-    estimate, sample, reasons = status["estimate"], status["sample"], status["reasons"]
+    estimate = status["estimate"]
+    sample = status["sample"]
+    reasons = status["reasons"]
     text = Text("SoC ", no_wrap=True, overflow="ellipsis")
     text.append(known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2), style="bold")
     text.append("  ")
@@ -140,8 +142,11 @@ def live_text(status: dict[str, Any]) -> Text:
 
 def status_values(status: dict[str, Any]) -> dict[str, str]:
     """Return names and values that show a status; a dash for what is not known yet."""
-    estimate, sample = status["estimate"], status["sample"] or {}
-    frames, reasons, config = status["frames"], _words(status["reasons"]), status["config"]
+    estimate = status["estimate"]
+    sample = status["sample"] or {}
+    frames = status["frames"]
+    reasons = _words(status["reasons"])
+    config = status["config"]
     bus = (status["bus"], status["bus_trouble"], _counts(status["bus_counts"]) or "no errors")
     stuck = "the receive loop hangs; restart the service"
     refused = f"the latest one is REFUSED, the old one stays: {config['problem']}"
@@ -175,10 +180,13 @@ def status_values(status: dict[str, Any]) -> dict[str, str]:
 
 def pack_values(report: Mapping[str, Any]) -> dict[str, str]:
     """Return names and values of health, power and cells, where known (`PackReport.to_dict`)."""
-    health, power, cells = report["health"], report["power"], report["cells"]
+    health = report["health"]
+    power = report["power"]
+    cells = report["cells"]
     values = {}
     if health is not None:
-        ratio, std = health["resistance_ratio"], health["resistance_std"]
+        ratio = health["resistance_ratio"]
+        std = health["resistance_std"]
         values = {
             "capacity": uncertain(health["capacity_ah"], health["capacity_std_ah"], "Ah"),
             "resistance": uncertain(ratio, std, "× the model's"),

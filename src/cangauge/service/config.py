@@ -475,7 +475,8 @@ def _keys(
 
 def default_of(key: Mapping[str, Any]) -> str:
     """Return the default of a key in words, "" for none."""
-    default, text = key.get("default"), key.get("default_text", "")
+    default = key.get("default")
+    text = key.get("default_text", "")
     if text or default is None or isinstance(default, dict):
         return str(text)
     if isinstance(default, bool):

@@ -105,8 +105,10 @@ class RateLimitedHandler(logging.StreamHandler[TextIO]):
         The event of other libraries is "log".
         """
         stamp = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        time_text, event = stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log"))
-        message, fields = record.getMessage(), dict(getattr(record, "fields", {}))
+        time_text = stamp.replace("+00:00", "Z")
+        event = str(getattr(record, "event", "log"))
+        message = record.getMessage()
+        fields = dict(getattr(record, "fields", {}))
         if record.exc_info is not None:
             message = f"{message}: {record.exc_info[1]!r}"
         if hasattr(record, "suppressed"):
@@ -133,7 +135,8 @@ class RateLimitedHandler(logging.StreamHandler[TextIO]):
     def _write(self, event: _Repetitions, record: logging.LogRecord, now_s: float) -> None:
         if event.suppressed:
             record.suppressed = event.suppressed
-        event.suppressed, event.held = 0, None
+        event.suppressed = 0
+        event.held = None
         event.interval_s = min(2.0 * event.interval_s, LONGEST_INTERVAL_S) or FIRST_INTERVAL_S
         event.next_s = now_s + event.interval_s
         self.emit(record)
@@ -158,7 +161,8 @@ def logging_to(
         levels |= {"": logging.DEBUG, "can": logging.NOTSET}
     loggers = {logging.getLogger(name): least for name, least in levels.items()}
     root = logging.getLogger()
-    before, levels_before = root.handlers, {logger: logger.level for logger in loggers}
+    before = root.handlers
+    levels_before = {logger: logger.level for logger in loggers}
     root.handlers = [handler]
     for logger, least in loggers.items():
         logger.setLevel(least)

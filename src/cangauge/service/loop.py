@@ -76,10 +76,13 @@ class Loop:
         checkpoint: Callable[[], None] | None = None,
         reload: Callable[[], RunConfig | None] | None = None,
     ) -> None:
-        self._port, self._pipeline, self._config = port, pipeline, config
+        self._port = port
+        self._pipeline = pipeline
+        self._config = config
         self._outputs = list(outputs)  # those that still take news
         self._monitor = monitor or Monitor(pipeline, port)
-        self._checkpoint, self._reload = checkpoint, reload
+        self._checkpoint = checkpoint
+        self._reload = reload
         self._published = OwnFrames(echoes=port.address.echoes)
         self._requested = OwnFrames(echoes=port.address.echoes)
         self._stamps_are_arrival = port.address.stamps != "driver"
@@ -106,8 +109,11 @@ class Loop:
         The filters also pass ids that show other senders: published frames, requests and
         REPLAY_CLOCK. `_others` has what to do with each.
         """
-        pipeline, poll, poller = self._pipeline, self._config.poll, self._poller
-        targets, ids = pipeline.vehicle.poll_targets, pipeline.settings.ids
+        pipeline = self._pipeline
+        poll = self._config.poll
+        poller = self._poller
+        targets = pipeline.vehicle.poll_targets
+        ids = pipeline.settings.ids
         self._poller = self._monitor.polls = None
         self._others: dict[int, Callable[[can.Message], None]] = {}
         if not pipeline.is_replay:
@@ -141,7 +147,8 @@ class Loop:
 
     def _is_over(self) -> bool:
         """Return whether the run's duration has passed, or no sample came for too long."""
-        duration_s, idle_s = self._config.duration_s, self._config.until_idle_s
+        duration_s = self._config.duration_s
+        idle_s = self._config.until_idle_s
         if duration_s is not None and self._now_s - self._began_s >= duration_s:
             return True
         has_begun = self._pipeline.samples > 0
@@ -173,8 +180,11 @@ class Loop:
 
     def _process(self, messages: list[can.Message], received_s: float) -> None:
         """Estimate from frames that were received together at a steady time [s]."""
-        pipeline, began_s = self._pipeline, self._now_s
-        samples, taken, stamp_s = pipeline.samples, pipeline.taken, math.nan
+        pipeline = self._pipeline
+        began_s = self._now_s
+        samples = pipeline.samples
+        taken = pipeline.taken
+        stamp_s = math.nan
         stamps = [message.timestamp for message in messages]
         waited_s = received_s - self._stamps.limit(messages, self._last_drained_s, received_s)
         for message, original_s in zip(messages, stamps, strict=True):
@@ -261,7 +271,8 @@ class Loop:
         reasons = {reason for event, reason in _REASONS.items() if event in found}
         if self._published.is_shared(self._now_s):
             reasons.add(Reason.DUPLICATE_SENDER)
-        silent_s, timeout_s = self._now_s - self._last_arrival_s, self._config.timeout_s
+        silent_s = self._now_s - self._last_arrival_s
+        timeout_s = self._config.timeout_s
         self._send(self._pipeline.heartbeat(silent_s, timeout_s, Reason(sum(reasons))))
         # Stay on the clock's grid; skip those missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._publish_due_s) / ESTIMATE_EVERY_S), 0)
@@ -281,7 +292,8 @@ class Loop:
 
     def _find(self) -> dict[str, str]:
         """Return what is wrong with time and signals at present: a sentence by event."""
-        decoder, found = self._pipeline.decoder, dict[str, str]()
+        decoder = self._pipeline.decoder
+        found = dict[str, str]()
         if self._stamps.is_uncertain(steady_s()):
             found["bus.time_uncertain"] = (
                 "the time stamps of the frames contradict the monotonic clock; the time of"
@@ -337,9 +349,11 @@ class Loop:
 
     def _housekeep(self) -> None:
         """Report lost frames, save, reload and show."""
-        now_s, drops = self._now_s, self._port.queue_drops or 0
+        now_s = self._now_s
+        drops = self._port.queue_drops or 0
         if drops > self._drops:
-            lost, self._drops = drops - self._drops, drops
+            lost = drops - self._drops
+            self._drops = drops
             _warn(
                 "bus.queue_overflow",
                 f"{self._port.name}: the receive queue overflowed: {lost} frames lost ({drops} so"

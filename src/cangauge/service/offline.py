@@ -127,7 +127,9 @@ class RecordedEstimate:
     @property
     def warnings(self) -> list[str]:
         """Reasons to doubt the estimate as a whole, one sentence each."""
-        scores, found, name = self.scores, [], self.model.name
+        scores = self.scores
+        found = []
+        name = self.model.name
         if scores.valid_fraction < DOUBTFUL_VALID:
             reasons = reason_sentences(int(np.bitwise_or.reduce(self.table.reasons)))
             found.append(
@@ -206,7 +208,8 @@ def estimate_recorded_log(
         origin = "log"
         start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
         settings = replace(settings, initial_soc_pct=start_pct)
-    began, estimator = time.perf_counter(), make_estimator(model, settings)
+    began = time.perf_counter()
+    estimator = make_estimator(model, settings)
     weakest = None
     if cells is not None:
         weakest = CellEstimator(estimator.voltage_model, cells.count, cells.first)
@@ -310,8 +313,10 @@ def estimate_capture(
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
     best = max(found, key=attrgetter("pipeline.samples"))
-    pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
-    settings, statistics = pipeline.estimator.settings, pipeline.decoder.statistics
+    pipeline = best.pipeline
+    table = EstimateTable.of(best.estimates)
+    settings = pipeline.estimator.settings
+    statistics = pipeline.decoder.statistics
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     recorded = CaptureSamples(
         _without_steps_back(time_s),
@@ -383,7 +388,8 @@ class _Bus:
 
 def _remarks(pipeline: Pipeline, buses: int) -> list[str]:
     """Return what a user must know of a capture's frames."""
-    counts, two_senders = pipeline.counts, pipeline.decoder.statistics.two_senders
+    counts = pipeline.counts
+    two_senders = pipeline.decoder.statistics.two_senders
     remarks = {
         "a recorded replay: time is its log's (REPLAY_CLOCK)": pipeline.is_replay,
         f"{counts['beginnings'] + 1} logs were replayed; each is estimated separately": counts[

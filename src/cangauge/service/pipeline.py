@@ -98,7 +98,8 @@ class Pipeline:
         *,
         publishes: bool = True,
     ) -> None:
-        self.vehicle, self.model = vehicle, model
+        self.vehicle = vehicle
+        self.model = model
         self.settings = settings = settings or PipelineSettings()
         self.is_replay = settings.time_source == "replay-clock"
         if publishes:
@@ -112,7 +113,8 @@ class Pipeline:
         self._refused = 0  # in a row
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
-        self.published, self.published_samples = NOTHING_YET, 0
+        self.published = NOTHING_YET
+        self.published_samples = 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: PackReport | None = None
         self.estimator = make_estimator(model, _with_sensors(settings.estimator, vehicle))
@@ -122,11 +124,14 @@ class Pipeline:
         """Begin to judge the signals anew, for the present vehicle and model."""
         self._pack = _pack_of(self.estimator)
         self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
-        self._voltage_s, self._without_voltage, self._lacks_voltage = math.inf, 0, False
+        self._voltage_s = math.inf
+        self._without_voltage = 0
+        self._lacks_voltage = False
         self._begin_cells()
 
     def _begin_cells(self) -> None:
-        cells, model = self.vehicle.cells_map, self.estimator.voltage_model
+        cells = self.vehicle.cells_map
+        model = self.estimator.voltage_model
         self.cells = None if cells is None else CellEstimator(model, cells.count, cells.first)
 
     # --- frames → estimates
@@ -142,7 +147,8 @@ class Pipeline:
             self._untimed += not (is_clock(message, clock_id) or is_count(message, clock_id))
             return False
         if self._time.beginnings != self._beginnings:
-            self._beginnings, self._refused = self._time.beginnings, 0
+            self._beginnings = self._time.beginnings
+            self._refused = 0
             self.estimator = make_estimator(self.model, self.estimator.settings)
             self._begin_signals()
         message.timestamp = time_s
@@ -213,7 +219,8 @@ class Pipeline:
 
     def _estimate_after(self, sample: Sample) -> None:
         self.samples += 1
-        self.latest_sample, self._report = sample, None
+        self.latest_sample = sample
+        self._report = None
         is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
         # The estimator treats a refused voltage otherwise than one that never came, as offline.
         self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
@@ -221,7 +228,8 @@ class Pipeline:
         self._note_voltage(sample)
         self._refused = self._refused + 1 if self.estimator.is_refused else 0
         self.taken += not self.estimator.is_refused
-        cells, received = self.cells, self.decoder.cells
+        cells = self.cells
+        received = self.decoder.cells
         if cells is not None and received is not None and cells.is_due(sample.time_s):
             volts, times = received.take(sample.time_s)
             changes = self.estimator.current_changes(sample.time_s, times)
@@ -235,7 +243,9 @@ class Pipeline:
         current is in few samples.
         """
         if not math.isnan(sample.voltage_v):
-            self._voltage_s, self._without_voltage, self._lacks_voltage = sample.time_s, 0, False
+            self._voltage_s = sample.time_s
+            self._without_voltage = 0
+            self._lacks_voltage = False
             return
         self._voltage_s = min(self._voltage_s, sample.time_s)  # time may run backwards
         self._without_voltage += 1
@@ -268,7 +278,8 @@ class Pipeline:
         """Return the frames due with the latest sample's estimate in a replay, else none."""
         if not self.is_replay:
             return []
-        self.published, self.published_samples = estimate, self.samples
+        self.published = estimate
+        self.published_samples = self.samples
         return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
@@ -331,7 +342,8 @@ class Pipeline:
         REPLAY_CLOCK's id always stay. InputError, and no change, if a frame to publish has the id
         of a vehicle's signal, or settings contradict the model.
         """
-        before, judged_by = self.estimator, (self.vehicle, self._pack)
+        before = self.estimator
+        judged_by = (self.vehicle, self._pack)
         is_other_model = model != self.model
         ids = replace(settings.ids, replay_clock=self.settings.ids.replay_clock)
         _check_ids(vehicle, ids)
@@ -348,7 +360,9 @@ class Pipeline:
             estimator.take_over(before)
             self.estimator = estimator
         self.settings = replace(settings, ids=ids, time_source=self.settings.time_source)
-        self.vehicle, self.model, self._report = vehicle, model, None
+        self.vehicle = vehicle
+        self.model = model
+        self._report = None
         self._publisher.ids = ids
         if judged_by != (vehicle, _pack_of(self.estimator)):
             self._begin_signals()
@@ -371,7 +385,8 @@ class Pipeline:
         """
         estimator = make_estimator(self.model, self.estimator.settings)
         latest = estimator.restore(state, age_s)
-        self.estimator, self._report = estimator, None
+        self.estimator = estimator
+        self._report = None
         if isinstance(self._time, ReplayClock):
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
@@ -392,7 +407,8 @@ class Pipeline:
 
 def _pack_of(estimator: Estimator) -> PackProperties:
     """Return the pack's properties by which its signals are judged."""
-    voltage, stated_ah = estimator.voltage_model, estimator.settings.capacity_ah
+    voltage = estimator.voltage_model
+    stated_ah = estimator.settings.capacity_ah
     return PackProperties(
         resistance_ohm=abs(voltage.loads.resistance_ohm[0]),
         error_std_v=estimator.model.noise.residual_std_v,

@@ -76,8 +76,10 @@ class Poller:
         if now_s < max(self._next_s(target), self._quiet_until_s):
             return None
         self.asked_s[target.request_id] = now_s
-        self._awaited, self._give_up_s = target, now_s + LONGEST_GAP_S
-        self._exchange_ends_s, self._may_continue = now_s + EXCHANGE_WITHIN_S, True
+        self._awaited = target
+        self._give_up_s = now_s + LONGEST_GAP_S
+        self._exchange_ends_s = now_s + EXCHANGE_WITHIN_S
+        self._may_continue = True
         self._reassembler = Reassembler()
         self.counts["requests"] += 1
         return _frame(target.request_id, bytes([len(target.request)]) + target.request)

@@ -114,14 +114,16 @@ class Recorder(Output):
             )
 
     def _hand_over(self) -> None:
-        batch, self._batch = self._batch, []
+        batch = self._batch
+        self._batch = []
         if batch and not self._worker.submit(partial(self._write, batch)):
             self._refused_frames += len(batch)
 
     # --- In the thread
 
     def _write(self, batch: list[can.Message]) -> None:
-        before, problem = self._problem, None
+        before = self._problem
+        problem = None
         try:
             self._file.write(batch)
         except OSError as error:
@@ -155,7 +157,9 @@ class _RecordFile:
 
     def __init__(self, base: Path, part_mb: float | None, keep_mb: float | None) -> None:
         base = written_name(base) if base.is_symlink() else base
-        self._base, self._part_mb, self._keep_mb = base, part_mb, keep_mb
+        self._base = base
+        self._part_mb = part_mb
+        self._keep_mb = keep_mb
         self._in_parts = part_mb is not None or os.path.lexists(base)
         self._run = max((run for run, _, _ in all_parts(base)), default=0) + 1
         self._part = self._bytes = self.written_bytes = 0
@@ -195,7 +199,8 @@ class _RecordFile:
     def close(self) -> None:
         """Close the file."""
         if self._descriptor >= 0:
-            descriptor, self._descriptor = self._descriptor, -1
+            descriptor = self._descriptor
+            self._descriptor = -1
             os.close(descriptor)
 
     def _next_part(self) -> None:
@@ -207,7 +212,8 @@ class _RecordFile:
         flags = os.O_WRONLY | os.O_CLOEXEC | os.O_CREAT | os.O_EXCL
         # The group may read where and how the car was driven, others not.
         self._descriptor = os.open(self.current, flags, 0o640)
-        self._part, self._bytes = part, 0
+        self._part = part
+        self._bytes = 0
         self._text = io.StringIO(newline="")
         self._writer = can.CanutilsLogWriter(self._text)
         # Otherwise it raises stamps below the first one, and hides a clock that was set back.

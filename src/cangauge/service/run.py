@@ -131,7 +131,9 @@ class Service:
         CangaugeError
             If the bus, the recording or an address cannot be opened.
         """
-        config, pipeline, began_s = self.config, self.pipeline, time.process_time()
+        config = self.config
+        pipeline = self.pipeline
+        began_s = time.process_time()
         with ExitStack() as stack:
             # Signals first: the service may be stopped at any moment from now on.
             if threading.current_thread() is threading.main_thread():
@@ -237,7 +239,8 @@ class Service:
             return None
         problem = self.apply(self._reading.result())
         self._reading = None
-        monitor.model, monitor.sign_cure = self.config.model, self._setup.sign_cure
+        monitor.model = self.config.model
+        monitor.sign_cure = self._setup.sign_cure
         monitor.reload_ends(problem)
         return self.config if problem is None else None
 
@@ -258,7 +261,9 @@ class Service:
 
 def log_end(status: Mapping[str, Any]) -> None:
     """Log the end of a run by its status: frames, losses and last SoC, and what is missing."""
-    frames, estimate, step_s = status["frames"], status["estimate"], status["step"]["mean_s"]
+    frames = status["frames"]
+    estimate = status["estimate"]
+    step_s = status["step"]["mean_s"]
     errors = "".join(
         f", {count} {COUNTED.get(name, name)}"
         for name, count in status["bus_counts"].items()
@@ -302,7 +307,9 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path
 
 
 def _log_changes(old: Setup, new: Setup) -> None:
-    before, after, keys = old.config.model_dump(), new.config.model_dump(), config_keys()
+    before = old.config.model_dump()
+    after = new.config.model_dump()
+    keys = config_keys()
     names = [name for name in keys if value_at(before, name) != value_at(after, name)]
     files = {
         "content of map or DBC": old.vehicle != new.vehicle,

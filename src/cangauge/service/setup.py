@@ -48,7 +48,8 @@ class Setup:
     def of(cls, config: RunConfig) -> Self:
         """Read all that a configuration names, without opening a bus; may raise InputError."""
         with config.naming_keys():
-            vehicle, model = load_vehicle(config), Model.load(config.model)
+            vehicle = load_vehicle(config)
+            model = Model.load(config.model)
             _check_poll(config, vehicle)
             _check_publish(config)
             outputs = tuple(
@@ -106,7 +107,8 @@ def pipeline_settings(config: RunConfig) -> PipelineSettings:
 
 def address_of(config: RunConfig) -> BusAddress:
     """Return the bus address of a configuration; may raise InputError."""
-    interface, channel = config.interface, config.channel
+    interface = config.interface
+    channel = config.channel
     if interface is None and config.wait_for_bus and channel and not is_multicast(channel):
         interface = "socketcan"  # cannot be detected while the interface is missing
     return bus_address(interface, channel, config.bus_options)
@@ -130,7 +132,8 @@ def _check_publish(config: RunConfig) -> None:
             value=config.time_source,
             cure="remove it, or [publish]",
         )
-    battery, inverter = address_of(config), inverter_address(publish)
+    battery = address_of(config)
+    inverter = inverter_address(publish)
     if str(battery) == str(inverter):
         problem = "is the battery's bus: a frame cannot be replaced on the bus that carries it"
         cure = "connect the inverter to a bus of its own"
@@ -139,7 +142,8 @@ def _check_publish(config: RunConfig) -> None:
         cure = "use SocketCAN on both buses, and remove receive_own_messages"
     else:
         return
-    field, value = "publish.channel", publish.channel
+    field = "publish.channel"
+    value = publish.channel
     raise InputError(problem, source=config.file, field=field, value=value, cure=cure)
 
 
@@ -154,7 +158,8 @@ def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
             " and request_id for a message of the map file; or remove [poll]"
         )
     elif config.time_source == "replay-clock":
-        problem, cure = "a replay has no battery that answers", "remove [poll], or time_source"
+        problem = "a replay has no battery that answers"
+        cure = "remove [poll], or time_source"
     elif config.bus_options.get("listen_only"):
         problem = "a bus that only listens sends no requests"
         cure = "remove listen_only from [bus_options], or [poll]"

@@ -192,7 +192,8 @@ class StateKeeper:
 
     def _age_s(self, content: StateContent) -> float:
         """Return the age of a state that may be used [s]; NaN: unknown. Else raise InputError."""
-        path, names = self._path, {"model": content.model_name, "battery": content.vehicle_name}
+        path = self._path
+        names = {"model": content.model_name, "battery": content.vehicle_name}
         for field, wanted in self._uses().items():
             if (owner := getattr(content, field)) != wanted:
                 raise InputError(
@@ -202,7 +203,8 @@ class StateKeeper:
                 )
         if content.time_source == "replay-clock":
             return 0.0
-        age_s, limit_s = self._wall_s() - content.saved_s, self._max_age_s
+        age_s = self._wall_s() - content.saved_s
+        limit_s = self._max_age_s
         if age_s > limit_s:
             raise InputError(
                 f"{age_s / 3600.0:.1f} h old, more than the limit of {limit_s / 3600.0:g} h",

@@ -113,13 +113,15 @@ class Monitor:
         clock: Callable[[], float] = time.monotonic,
         sign_cure: str = "set the other sign under [current] of the map file",
     ) -> None:
-        self.model, self.sign_cure = model, sign_cure
+        self.model = model
+        self.sign_cure = sign_cure
         self.foreign = 0
         self.polls: dict[str, int] | None = None
         self._pipeline = pipeline
         self._port = port
         self._notifier = notifier or Notifier()
-        self._recorder, self._outputs = recorder, outputs
+        self._recorder = recorder
+        self._outputs = outputs
         self._clock = clock
         self._began_s = now_s = clock()
         self._latency = Histogram()
@@ -151,7 +153,8 @@ class Monitor:
 
     def sent(self) -> None:
         """Count the latency of the latest sample, whose estimate was just sent."""
-        stamp_s, self._unsent_stamp_s = self._unsent_stamp_s, None
+        stamp_s = self._unsent_stamp_s
+        self._unsent_stamp_s = None
         # Skip stamps of another clock, and those before the clock was set.
         if stamp_s is not None and 0.0 <= (latency_s := time.time() - stamp_s) < CLOCKS_APART_S:
             self._latency.add(latency_s)
@@ -188,8 +191,11 @@ class Monitor:
 
     def _object(self, now_s: float) -> dict[str, Any]:
         """Return the object of `/status`."""
-        pipeline, port = self._pipeline, self._port
-        estimate, sample, samples = pipeline.published, pipeline.latest_sample, pipeline.samples
+        pipeline = self._pipeline
+        port = self._port
+        estimate = pipeline.published
+        sample = pipeline.latest_sample
+        samples = pipeline.samples
         since_s, before = self._rate_from
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
@@ -197,7 +203,8 @@ class Monitor:
         if samples and now_s >= self._report_due_s:
             self._report_due_s = now_s + NOTIFY_EVERY_S
             self._report = pipeline.report().to_dict()
-        statistics, settings = pipeline.decoder.statistics, pipeline.settings
+        statistics = pipeline.decoder.statistics
+        settings = pipeline.settings
         rejects = {name: getattr(statistics, name) for name in _REJECTS}
         rejected = sum(count for name, count in rejects.items() if name not in _OF_VALUES)
         counts = {name: getattr(port, name, None) for name in BUS_COUNTS}
@@ -272,7 +279,8 @@ class Monitor:
         self._notices = notices
         if estimate.status is self._status:
             return
-        before, self._status = self._status, estimate.status
+        before = self._status
+        self._status = estimate.status
         emit(
             _LOG.warning if estimate.status is Status.INVALID else _LOG.info,
             "status.changed",

@@ -232,7 +232,8 @@ def fetch_status(path: Path) -> dict[str, Any]:
     CangaugeError
         If the answer is not a status.
     """
-    answer, until_s = b"", time.monotonic() + ANSWER_WITHIN_S
+    answer = b""
+    until_s = time.monotonic() + ANSWER_WITHIN_S
     try:
         with _connected(path) as connection:
             while len(answer) < 1 << 20 and (part := connection.recv(1 << 16)):
