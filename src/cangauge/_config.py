@@ -43,8 +43,7 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # ValueError: also not UTF-8
-        is_deep = isinstance(error, RecursionError)
-        problem = "nested too deeply" if is_deep else str(error)
+        problem = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise InputError(f"not TOML: {problem}", source=path) from error
 
 

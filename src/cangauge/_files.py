@@ -485,8 +485,8 @@ def _create_beside(
             raise InputError("this is a folder", source=shown, cure="name a file in it")
         if os.path.lexists(target) and _is_kept_by_another(target):
             raise InputError("another user has made it", source=shown, cure="name another file")
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
-        return part, os.open(part, flags, 0o600 if target.exists() else rights)
+        mode = 0o600 if target.exists() else rights
+        return part, os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(
             error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")
@@ -530,8 +530,7 @@ def write_texts_atomic(texts: Mapping[Path, str]) -> None:
     """Write several files as UTF-8, all or none (see `atomic_path`)."""
     with ExitStack() as stack:
         for path, text in texts.items():
-            part = stack.enter_context(atomic_path(path))
-            part.write_text(text, encoding="utf-8", newline="\n")
+            stack.enter_context(atomic_path(path)).write_text(text, encoding="utf-8", newline="\n")
 
 
 def check_writable(path: str | PathLike[str]) -> None:

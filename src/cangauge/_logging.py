@@ -27,5 +27,4 @@ def emit(
     Events with the same `limit` share one rate limit, as they supersede each other (the states of
     a bus). `fields` are further keys of the JSON object, with units in their names.
     """
-    extra = {"event": event, "limit": limit or event, "fields": fields}
-    log("%s", text, extra=extra)
+    log("%s", text, extra={"event": event, "limit": limit or event, "fields": fields})

@@ -102,9 +102,8 @@ def demo_command(
     offline, _ = estimate_log(log, model, settings)
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
-    page = extra("report.estimate:estimate_page")(estimate, paths["model"]).html()
-    write_text_atomic(paths["soc_page"], page)
-    bound_pct = quantization_bound(Vehicle.load("generic"), model, log)["ekf"]
+    page = extra("report.estimate:estimate_page")(estimate, paths["model"])
+    write_text_atomic(paths["soc_page"], page.html())
     result = {
         "log": "a reconstruction of the published 2012 Leaf test, no recording",
         "current_offset_a": SENSOR_OFFSET_A,
@@ -112,7 +111,7 @@ def demo_command(
         "fit_soc_newton_mae_pct": identification.soc_newton_mae_pct,
         **{f"live_{name}": value for name, value in vars(live).items()},
         "live_minus_offline_pct": float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct))),
-        "quantisation_bound_pct": bound_pct,
+        "quantisation_bound_pct": quantization_bound(vehicle, model, log)["ekf"],
         "seconds": time.monotonic() - began,
         **{name: str(path) for name, path in paths.items()},
     }
@@ -131,10 +130,12 @@ def _play(folder: Path, log: Path) -> float:
     write_text_atomic(config, CONFIGURATION + (f'dashboard = "{page}"\n' if page else ""))
     cangauge = [sys.executable, "-P", "-m", "cangauge"]  # -P: no modules of the working folder
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    service = [*cangauge, "run", "--config", str(config)]
     began = time.monotonic()
     with subprocess.Popen(  # noqa: S603 - our own commands
-        service, stderr=subprocess.PIPE, text=True, env=environment
+        [*cangauge, "run", "--config", str(config)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
     ) as running:
         replay = subprocess.run(  # noqa: S603 - our own commands
             [*cangauge, "replay", str(log), "--speed", "max"], check=False, env=environment
@@ -146,8 +147,10 @@ def _play(folder: Path, log: Path) -> float:
             running.kill()
             raise CangaugeError("the service did not exit after the replay") from None
     if replay.returncode or running.returncode:
-        codes = f"replay exited with {replay.returncode}, the service with {running.returncode}"
-        raise CangaugeError(f"{codes}: {errors.strip()}")
+        raise CangaugeError(
+            f"replay exited with {replay.returncode}, the service with {running.returncode}:"
+            f" {errors.strip()}"
+        )
     return seconds
 
 
@@ -165,13 +168,14 @@ def _show(result: dict[str, Any]) -> None:
         ("live minus offline, largest", "live_minus_offline_pct", ""),
         ("  bound from rounding in frames", "quantisation_bound_pct", ""),
     ]
-    cover = number(100.0 * result["live_cover_2sigma"], 1, "%")
     print_table(
         f"Reconstructed Leaf test, live; current {SENSOR_OFFSET_A:g} A too high",
         ["error", "here", "published"],
         [[name, significant(result[key], 3, "%"), published] for name, key, published in rows]
-        + [["reference within ±2σ", cover, ""]],
+        + [["reference within ±2σ", number(100.0 * result["live_cover_2sigma"], 1, "%"), ""]],
     )
-    seconds = f"{result['live_seconds']:.0f} s over the bus; {result['seconds']:.0f} s in total"
-    note(f"{result['live_rows']} samples in {seconds}")
+    note(
+        f"{result['live_rows']} samples in {result['live_seconds']:.0f} s over the bus;"
+        f" {result['seconds']:.0f} s in total"
+    )
     note(f"open {result['soc_page']} (SoC against reference) and {result['fit_page']} (the model)")

@@ -142,9 +142,12 @@ def estimate_command(
     )
     page = extra("report.estimate:estimate_page")(done, model).html() if report else ""
     with ExitStack() as all_of_them:
-        is_parquet = output.suffix.lower() == ".parquet"
-        part = all_of_them.enter_context(atomic_path(output))
-        write_estimates(part, done.recorded.time_s, done.table, is_parquet=is_parquet)
+        write_estimates(
+            all_of_them.enter_context(atomic_path(output)),
+            done.recorded.time_s,
+            done.table,
+            is_parquet=output.suffix.lower() == ".parquet",
+        )
         if report is not None:
             all_of_them.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
         if pack is not None:
@@ -153,8 +156,12 @@ def estimate_command(
         remark(f"warning: {done.recorded.source}: {warning}")
     logs = [done.recorded] if isinstance(done.recorded, Log) else []
     found = done.to_dict() | {"assumed": assumed_of(logs)}
-    show = partial(_show, done.recorded.name, found, done.table)
-    finish(found, show, files, as_json=json_output)
+    finish(
+        found,
+        partial(_show, done.recorded.name, found, done.table),
+        files,
+        as_json=json_output,
+    )
 
 
 def estimate_file(
@@ -177,9 +184,13 @@ def estimate_file(
             show_line(f"{path.name}: {count} rows")
 
         if not isinstance(reading.open(path), LogFile):
-            car = reading.car_of(path)
             done = estimate_capture(
-                path, car, model, settings, keeps_pack=keeps_pack, progress=show
+                path,
+                reading.car_of(path),
+                model,
+                settings,
+                keeps_pack=keeps_pack,
+                progress=show,
             )
         else:
             log = reading.load(path)

@@ -210,8 +210,12 @@ def fit_command(
             texts[report] = extra("report.fit:fit_page")(result).html()
         write_texts_atomic(texts)
     found = result.to_dict() | {"assumed": assumed_of(recorded)}
-    files = {"model": output, "report": report}
-    finish(found, partial(_show, result), files, as_json=json_output)
+    finish(
+        found,
+        partial(_show, result),
+        {"model": output, "report": report},
+        as_json=json_output,
+    )
 
 
 def _cells_of(log: Log, reading: ReadingOptions) -> int | None:

@@ -216,8 +216,10 @@ def _write(
 
 def _added_test(logs: list[Log], before: Diagnosis) -> dict[str, Any]:
     """Return the names of the logs of a test, and the probabilities without them, for JSON."""
-    probabilities = {"none": before.posterior.none, **before.posterior.faults}
-    return {"logs": [log.name for log in logs], "before": probabilities}
+    return {
+        "logs": [log.name for log in logs],
+        "before": {"none": before.posterior.none, **before.posterior.faults},
+    }
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
@@ -258,8 +260,7 @@ def _column_of(log: Log, heading: str, reading: ReadingOptions) -> FloatArray:
 
     texts = ColumnMap.of(reading.columns or {}, "--columns").texts
     columns = ColumnMap({**texts, "voltage": heading}, "--simulated")
-    file = open_log(log.source, columns=columns)
-    simulated = file.read(temperature_c=reading.temperature)
+    simulated = open_log(log.source, columns=columns).read(temperature_c=reading.temperature)
     if not np.array_equal(simulated.time_s, log.time_s):
         raise InputError(
             f"{len(simulated)} rows have a simulated voltage, {len(log)} a measured one",

@@ -131,8 +131,10 @@ def _show_log(found: LogInspection) -> None:
         f" net {charge.net_ah:+.4g} Ah."
     )
     if soc is not None:
-        share = f"in {100.0 * soc.coverage:.1f} % of the rows"
-        say(f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %, {share}.")
+        say(
+            f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %, in"
+            f" {100.0 * soc.coverage:.1f} % of the rows."
+        )
     say(f"Sign: {found.sign.sentence}.")
     head, rows = ability_rows(found)
     print_table("What this log can identify", head, rows[1:])  # the first is the sign
@@ -155,11 +157,15 @@ def _show_capture(found: CaptureInspection) -> None:
         if preset.matches:
             spans = ((getattr(preset, name), unit) for name, unit in _RANGES.items())
             shown = ", ".join(f"{s[0]:.5g} … {s[1]:.5g} {unit}" for s, unit in spans if s)
-            about = f"{preset.about} (--vehicle {preset.preset})"
-            say(f"Vehicle: {about}, {preset.samples:,} samples: {shown}.")
+            say(
+                f"Vehicle: {preset.about} (--vehicle {preset.preset}), {preset.samples:,} samples:"
+                f" {shown}."
+            )
     if not found.matching and found.log is None:
-        command = f"cangauge init {shlex.quote(found.source)} -o mycar"
-        say(f"No known vehicle. Find its signals: {command}")
+        say(
+            "No known vehicle. Find its signals: cangauge init"
+            f" {shlex.quote(found.source)} -o mycar"
+        )
     print_table("Frames", *_rows_of_ids(found))
     counts = {words: getattr(found, name) for name, words in _COUNTS.items()}
     if shown := ", ".join(f"{count:,} {words}" for words, count in counts.items() if count):
@@ -167,8 +173,10 @@ def _show_capture(found: CaptureInspection) -> None:
     if found.gaps:
         gap = max(found.gaps, key=itemgetter("length_s"))
         others = f", the longest of {len(found.gaps)}" if len(found.gaps) > 1 else ""
-        after_s = gap["start_s"] - found.start_s
-        say(f"Silence of {gap['length_s']:.3g} s after {after_s:.1f} s{others}.")
+        say(
+            f"Silence of {gap['length_s']:.3g} s after {gap['start_s'] - found.start_s:.1f} s"
+            f"{others}."
+        )
     for line in info["remarks"] if found.log is None else ():  # the log's hold them
         say(f"Remarks: {line}")
     if found.log is not None:

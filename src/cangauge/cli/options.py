@@ -398,9 +398,14 @@ def config_parameters(*names: str) -> list[inspect.Parameter]:
         if default := default_of(key):
             text += f" Default: {default}."
         option = typer.Option(*key["option"].split(", "), metavar=key["metavar"], help=text)
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        annotation = Annotated[kind | None, option]
-        made.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
+        made.append(
+            inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=None,
+                annotation=Annotated[kind | None, option],
+            )
+        )
     return made
 
 

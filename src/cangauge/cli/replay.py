@@ -98,7 +98,6 @@ def replay_command(
     source = _source(recorded, columns, loaded)
     address = address_of(loaded)
     stopped: list[bool] = []
-    factor = math.inf if speed == "max" else speed
     with ExitStack() as stack:
         stack.enter_context(stop_on_signals(partial(stopped.append, True)))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
@@ -112,7 +111,15 @@ def replay_command(
         def is_stopped() -> bool:
             return bool(stopped)
 
-        state = play(bus, source, stop=is_stopped, show=show, speed=factor, loop=loop, ids=ids)
+        state = play(
+            bus,
+            source,
+            stop=is_stopped,
+            show=show,
+            speed=math.inf if speed == "max" else speed,
+            loop=loop,
+            ids=ids,
+        )
     note(_line(state))
     if bus.unsent:
         note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")
@@ -128,8 +135,7 @@ def _source(recorded: Path, columns: str | None, config: RunConfig) -> Source:
     from cangauge.service.setup import load_vehicle
 
     map_file = None if config.map is None else Path(config.map)
-    reading = ReadingOptions(map_file=map_file, columns=columns)
-    recording = reading.open(recorded)
+    recording = ReadingOptions(map_file=map_file, columns=columns).open(recorded)
     if not isinstance(recording, LogFile):
         is_named = (config.vehicle, config.dbc, config.map) != (None, None, None)
         return CaptureSource(recorded, load_vehicle(config) if is_named else None, config.ids)

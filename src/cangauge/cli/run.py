@@ -141,5 +141,8 @@ def check_command(
         name.replace("_", " "): ", ".join(value) if isinstance(value, list) else str(value)
         for name, value in found.items()
     }
-    show = partial(print_values, f"{config}: `cangauge run` takes it", rows)
-    finish(found, show, as_json=json_output)
+    finish(
+        found,
+        partial(print_values, f"{config}: `cangauge run` takes it", rows),
+        as_json=json_output,
+    )

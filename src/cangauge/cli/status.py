@@ -148,7 +148,6 @@ def status_values(status: dict[str, Any]) -> dict[str, str]:
     reasons = _words(status["reasons"])
     config = status["config"]
     bus = (status["bus"], status["bus_trouble"], _counts(status["bus_counts"]) or "no errors")
-    stuck = "the receive loop hangs; restart the service"
     refused = f"the latest one is REFUSED, the old one stays: {config['problem']}"
     reading = "reading a new one" if config["reloading"] else NONE_KNOWN
     recorded = NONE_KNOWN
@@ -156,7 +155,9 @@ def status_values(status: dict[str, Any]) -> dict[str, str]:
         recorded = f"{record['path']}, {record['lost_frames']} frames lost"
         recorded += f"; FAILING: {record['problem']}" if record["problem"] else ""
     return {
-        "LOOP STUCK": stuck if status["loop_stuck"] else NONE_KNOWN,
+        "LOOP STUCK": "the receive loop hangs; restart the service"
+        if status["loop_stuck"]
+        else NONE_KNOWN,
         "SoC": known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2),
         "status": status["status"] + (f": {reasons}" if reasons else ""),
         "by voltage alone": number(estimate["soc_newton_pct"], 2, "%"),
@@ -185,27 +186,28 @@ def pack_values(report: Mapping[str, Any]) -> dict[str, str]:
     cells = report["cells"]
     values = {}
     if health is not None:
-        ratio = health["resistance_ratio"]
-        std = health["resistance_std"]
         values = {
             "capacity": uncertain(health["capacity_ah"], health["capacity_std_ah"], "Ah"),
-            "resistance": uncertain(ratio, std, "× the model's"),
+            "resistance": uncertain(
+                health["resistance_ratio"], health["resistance_std"], "× the model's"
+            ),
             "current offset": number(health["offset_a"], 2, "A"),
         }
     if power is not None:
         for way in ("discharge", "charge"):
-            currents = power[f"{way}_a"], power[f"{way}_std_a"]
-            values[f"possible {way}, 10 s"] = possible(*currents, "A")
+            values[f"possible {way}, 10 s"] = possible(
+                power[f"{way}_a"], power[f"{way}_std_a"], "A"
+            )
         left = energy_text(power["energy_wh"], power["energy_std_wh"])
         to_pct = power["energy_to_soc_pct"]
         values["energy left"] = left if to_pct is None else f"{left} to {to_pct:.0f} % SoC"
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
         less = uncertain(cells["sum_error_v"], cells["sum_std_v"], "V")
-        spread = number(cells["spread_pct"], 1, "%")
         values |= {
             "weakest cell": weakest + uncertain(cells["soc_pct"], cells["soc_std_pct"], "%"),
-            "cells": f"{cells['cells']} known, spread {spread}; pack less their sum {less}",
+            "cells": f"{cells['cells']} known, spread {number(cells['spread_pct'], 1, '%')}; pack"
+            f" less their sum {less}",
         }
     return values
 

@@ -396,9 +396,12 @@ class RunConfig(BaseModel):
             key = (error.field or "").removeprefix("--").replace("-", "_")
             if error.source is not None or key in self._options or self._file == _NO_FILE:
                 raise
-            cure = error.cure and re.sub("--([a-z][a-z-]*)", _as_key, error.cure)
             raise InputError(
-                error.problem, source=self._file, field=key, value=error.value, cure=cure
+                error.problem,
+                source=self._file,
+                field=key,
+                value=error.value,
+                cure=error.cure and re.sub("--([a-z][a-z-]*)", _as_key, error.cure),
             ) from error
 
 

@@ -114,9 +114,9 @@ def _locked(lock: Path, shown: str | PathLike[str]) -> BinaryIO:
     if fcntl is None:
         raise OSError(errno.ENOLCK, "no file locks")
     while True:
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | NO_LINK
+        opened = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | NO_LINK, 0o600)
         with ExitStack() as closing:
-            file = closing.enter_context(open(os.open(lock, flags, 0o600), "r+b", buffering=0))  # noqa: PTH123
+            file = closing.enter_context(open(opened, "r+b", buffering=0))  # noqa: PTH123
             info = os.fstat(file.fileno())
             if not is_own(info) and info.st_uid != lock.parent.stat().st_uid:
                 raise OSError(errno.EPERM, "another user's file")

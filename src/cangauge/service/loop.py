@@ -151,8 +151,8 @@ class Loop:
         idle_s = self._config.until_idle_s
         if duration_s is not None and self._now_s - self._began_s >= duration_s:
             return True
-        has_begun = self._pipeline.samples > 0
-        return idle_s is not None and has_begun and self._now_s - self._last_sample_s >= idle_s
+        is_idle = idle_s is not None and self._now_s - self._last_sample_s >= idle_s
+        return is_idle and self._pipeline.samples > 0
 
     def _iterate(self) -> None:
         """Receive once, process the frames, and do what is due."""
@@ -271,9 +271,13 @@ class Loop:
         reasons = {reason for event, reason in _REASONS.items() if event in found}
         if self._published.is_shared(self._now_s):
             reasons.add(Reason.DUPLICATE_SENDER)
-        silent_s = self._now_s - self._last_arrival_s
-        timeout_s = self._config.timeout_s
-        self._send(self._pipeline.heartbeat(silent_s, timeout_s, Reason(sum(reasons))))
+        self._send(
+            self._pipeline.heartbeat(
+                self._now_s - self._last_arrival_s,
+                self._config.timeout_s,
+                Reason(sum(reasons)),
+            )
+        )
         # Stay on the clock's grid; skip those missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._publish_due_s) / ESTIMATE_EVERY_S), 0)
         self._publish_due_s += (missed + 1) * ESTIMATE_EVERY_S
@@ -307,17 +311,16 @@ class Loop:
                 " number it in the DBC with the pack's source address, and remove that line)"
             )
         if self._pipeline.is_unpaired:
-            within_s = self._pipeline.vehicle.pair_within_s
             found["bus.unpaired"] = (
-                f"voltages come, but not within {within_s:g} s of a current: they are not used;"
-                " give a longer pair_within_s in the map file"
+                f"voltages come, but not within {self._pipeline.vehicle.pair_within_s:g} s of a"
+                " current: they are not used; give a longer pair_within_s in the map file"
             )
         if decoder.unsigned_current is not None:
             found["bus.unsigned_current"] = decoder.unsigned_current
         found |= {f"bus.wrong_period {name}": text for name, text in decoder.wrong_periods.items()}
         if self._now_s - self._began_s > SLOWEST_S:  # each reply was asked for
-            unseen = decoder.never_decoded
-            found |= {f"bus.never_seen {role}": text for role, text in unseen.items()}
+            for role, text in decoder.never_decoded.items():
+                found[f"bus.never_seen {role}"] = text
         return found
 
     def _send(self, frames: list[can.Message]) -> None:
@@ -352,13 +355,12 @@ class Loop:
         now_s = self._now_s
         drops = self._port.queue_drops or 0
         if drops > self._drops:
-            lost = drops - self._drops
-            self._drops = drops
             _warn(
                 "bus.queue_overflow",
-                f"{self._port.name}: the receive queue overflowed: {lost} frames lost ({drops} so"
-                " far)",
+                f"{self._port.name}: the receive queue overflowed: {drops - self._drops} frames"
+                f" lost ({drops} so far)",
             )
+            self._drops = drops
         if now_s >= self._save_due_s:
             self._save_due_s = now_s + self._config.state_every_s
             self._save()

@@ -206,8 +206,8 @@ def estimate_recorded_log(
     settings = replace(settings, temperature_source=log.temperature_source, gap_s=gap_of(log))
     if soc_from_log and log.first_soc() is not None:
         origin = "log"
-        start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
-        settings = replace(settings, initial_soc_pct=start_pct)
+        capacity_ah = settings.capacity_ah or model.capacity_ah
+        settings = replace(settings, initial_soc_pct=initial_soc_of(log, capacity_ah))
     began = time.perf_counter()
     estimator = make_estimator(model, settings)
     weakest = None
@@ -218,14 +218,16 @@ def estimate_recorded_log(
     volts = iter(() if cells is None else cells.voltage_v)
 
     def report() -> PackReport:
-        found = None if weakest is None else weakest.report
-        return PackReport(estimator.health, estimator.power(), found)
+        return PackReport(
+            estimator.health,
+            estimator.power(),
+            None if weakest is None else weakest.report,
+        )
 
     def observe(sample: Sample) -> None:
         row = next(volts, None)
         if weakest is not None and row is not None and weakest.is_due(sample.time_s):
-            changes = [0.0] * len(row)
-            weakest.update(estimator.pack_tick(sample), row.tolist(), changes)
+            weakest.update(estimator.pack_tick(sample), row.tolist(), [0.0] * len(row))
         if keeps_pack:
             _add_row(rows, every_s, sample.time_s, report)
 

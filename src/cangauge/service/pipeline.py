@@ -25,7 +25,7 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.model.model_file import Model
-from cangauge.settings import FrameIds, TimeSourceName
+from cangauge.settings import START_STD_PCT, FrameIds, TimeSourceName
 from cangauge.types import REASONS, Estimate, Reason, Sample, Status, status_of
 
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)
@@ -104,8 +104,7 @@ class Pipeline:
         self.is_replay = settings.time_source == "replay-clock"
         if publishes:
             _check_ids(vehicle, settings.ids)
-        every = ACKNOWLEDGE_EVERY if self.is_replay else None
-        self._publisher = SocPublisher(settings.ids, every)
+        self._publisher = SocPublisher(settings.ids, ACKNOWLEDGE_EVERY if self.is_replay else None)
         self._time = time_source(settings.time_source, settings.ids.replay_clock)
         self._statistics = FrameStatistics()
         self._beginnings = self._untimed = 0
@@ -178,8 +177,11 @@ class Pipeline:
     def report(self) -> PackReport:
         """Return health, power and cells after the latest sample; computed once a sample."""
         if self._report is None:
-            cells = None if self.cells is None else self.cells.report
-            self._report = PackReport(self.estimator.health, self.estimator.power(), cells)
+            self._report = PackReport(
+                self.estimator.health,
+                self.estimator.power(),
+                None if self.cells is None else self.cells.report,
+            )
         return self._report
 
     @property
@@ -327,8 +329,8 @@ class Pipeline:
         estimate = _with_reasons(estimate, estimate.reasons | reasons)
         if estimate.status is not Status.INVALID:
             return estimate
-        missing_pct = self.estimator.uncounted_std_pct(silent_s)
-        return estimate._replace(soc_std_pct=math.hypot(estimate.soc_std_pct, missing_pct))
+        std_pct = math.hypot(estimate.soc_std_pct, self.estimator.uncounted_std_pct(silent_s))
+        return estimate._replace(soc_std_pct=std_pct)
 
     # --- reload and restart
 
@@ -419,8 +421,7 @@ def _pack_of(estimator: Estimator) -> PackProperties:
 
 def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
     """Return the settings without an initial SoC."""
-    std_pct = EstimatorSettings().initial_soc_std_pct
-    return replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
+    return replace(settings, initial_soc_pct=None, initial_soc_std_pct=START_STD_PCT)
 
 
 def _with_reasons(estimate: Estimate, reasons: Reason) -> Estimate:

@@ -130,5 +130,6 @@ class Poller:
 
 
 def _frame(request_id: int, payload: bytes) -> can.Message:
-    data = payload.ljust(8, b"\0")
-    return can.Message(arbitration_id=request_id, is_extended_id=False, data=data)
+    return can.Message(
+        arbitration_id=request_id, is_extended_id=False, data=payload.ljust(8, b"\0")
+    )

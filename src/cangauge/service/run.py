@@ -189,9 +189,10 @@ class Service:
                 reload=partial(self._poll_reload, monitor),
             )
             loop.run(self._is_done)
-        recording = None if self.recorder is None else str(self.recorder.written)
-        cpu_s = time.process_time() - began_s
-        status = monitor.final() | {"cpu_seconds": cpu_s, "recording": recording}
+        status = monitor.final() | {
+            "cpu_seconds": time.process_time() - began_s,
+            "recording": self.recorder and str(self.recorder.written),
+        }
         log_end(status)
         return status
 
@@ -311,11 +312,11 @@ def _log_changes(old: Setup, new: Setup) -> None:
     after = new.config.model_dump()
     keys = config_keys()
     names = [name for name in keys if value_at(before, name) != value_at(after, name)]
-    files = {
-        "content of map or DBC": old.vehicle != new.vehicle,
-        "content of the model": old.model != new.model,
-    }
-    changed = [*names, *(name for name, is_other in files.items() if is_other)]
+    changed = [
+        *names,
+        *["content of map or DBC"] * (old.vehicle != new.vehicle),
+        *["content of the model"] * (old.model != new.model),
+    ]
     text = f"configuration reloaded; changed: {', '.join(changed) or 'nothing'}"
     if old.vehicle.battery != new.vehicle.battery:
         text += "; current or voltage are decoded otherwise: the SoC starts anew from the voltage"

@@ -57,8 +57,14 @@ class Setup:
                 for module, keys in OUTPUTS.items()
                 if any(getattr(config, key) is not None for key in keys)
             )
-            cure = _sign_cure(config, vehicle)
-            return cls(config, vehicle, model, pipeline_settings(config), cure, outputs)
+            return cls(
+                config,
+                vehicle,
+                model,
+                pipeline_settings(config),
+                _sign_cure(config, vehicle),
+                outputs,
+            )
 
 
 def read_setup(read: Callable[[], RunConfig]) -> Setup | CangaugeError:
@@ -142,9 +148,13 @@ def _check_publish(config: RunConfig) -> None:
         cure = "use SocketCAN on both buses, and remove receive_own_messages"
     else:
         return
-    field = "publish.channel"
-    value = publish.channel
-    raise InputError(problem, source=config.file, field=field, value=value, cure=cure)
+    raise InputError(
+        problem,
+        source=config.file,
+        field="publish.channel",
+        value=publish.channel,
+        cure=cure,
+    )
 
 
 def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:

@@ -145,11 +145,11 @@ class StateKeeper:
         ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
         if content.estimator.writer != self._pipeline.estimator.writer:
             ago += ", of another release, method or capacity, of which the SoC alone is kept"
-        soc = known_soc(latest.soc_pct, latest.soc_std_pct, 2)
         emit(
             _LOG.info,
             "state.restored",
-            f"{self._path}: continuing from a state {ago}: SoC {soc}",
+            f"{self._path}: continuing from a state {ago}: SoC"
+            f" {known_soc(latest.soc_pct, latest.soc_std_pct, 2)}",
         )
         return self
 
