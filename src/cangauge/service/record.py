@@ -76,18 +76,29 @@ class Recorder(Output):
         self._batch: list[can.Message] = []
         self._frames = self._refused_frames = self._unwritten_frames = 0
         self._problem: str | None = None
-        self._file = _RecordFile(Path(path), part_mb, keep_mb)
-        self.written = self._file.path
-        self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
+        base = Path(path)
+        base = written_name(base) if base.is_symlink() else base
+        self._base = base
+        self._part_mb = part_mb
+        self._keep_mb = keep_mb
+        self._in_parts = part_mb is not None or os.path.lexists(base)
+        self._run = max((run for run, _, _ in all_parts(base)), default=0) + 1
+        self.written = run_path(base, self._run) if self._in_parts else base
+        self._part = self._bytes = self._written_bytes = 0
+        self._synced_s = time.monotonic()
+        self._descriptor = -1
+        with suppress(OSError):  # tried again with each batch
+            self._next_part()
+        self._worker = Worker("cangauge-record", _failed, BATCHES_WAITING)
 
     @property
     def state(self) -> dict[str, Any]:
         """Current file; frames so far, and those lost; `problem`: why the disk rejects data now."""
         return {
-            "path": str(self._file.current),
+            "path": str(self._current),
             "frames": self._frames,
             "lost_frames": self._refused_frames + self._unwritten_frames,
-            "written_bytes": self._file.written_bytes,
+            "written_bytes": self._written_bytes,
             "problem": self._problem,
         }
 
@@ -105,12 +116,12 @@ class Recorder(Output):
     def close(self) -> None:
         """Complete the file; frames that are not written in time are lost."""
         self._hand_over()
-        self._worker.submit(self._file.close)
+        self._worker.submit(self._close_file)
         if not self._worker.close(CLOSE_WITHIN_S):
             emit(
                 _LOG.error,
                 "record.incomplete",
-                f"{self._file.current}: the end of the recording is missing",
+                f"{self._current}: the end of the recording is missing",
             )
 
     def _hand_over(self) -> None:
@@ -125,7 +136,7 @@ class Recorder(Output):
         before = self._problem
         problem = None
         try:
-            self._file.write(batch)
+            self._append(batch)
         except OSError as error:
             problem = error.strerror or str(error)
             self._unwritten_frames += len(batch)
@@ -147,30 +158,8 @@ class Recorder(Output):
                 lost_frames=lost,
             )
 
-    @staticmethod
-    def _failed(error: Exception) -> None:
-        _emit_state(_LOG.error, "record.failed", f"recording: {error}")
-
-
-class _RecordFile:
-    """The file or the parts of one recording, written batch by batch; methods may raise OSError."""
-
-    def __init__(self, base: Path, part_mb: float | None, keep_mb: float | None) -> None:
-        base = written_name(base) if base.is_symlink() else base
-        self._base = base
-        self._part_mb = part_mb
-        self._keep_mb = keep_mb
-        self._in_parts = part_mb is not None or os.path.lexists(base)
-        self._run = max((run for run, _, _ in all_parts(base)), default=0) + 1
-        self._part = self._bytes = self.written_bytes = 0
-        self.path = run_path(base, self._run) if self._in_parts else base
-        self._synced_s = time.monotonic()
-        self._descriptor = -1
-        with suppress(OSError):  # tried again with each batch
-            self._next_part()
-
-    def write(self, batch: list[can.Message]) -> None:
-        """Append frames as whole lines, or nothing of them."""
+    def _append(self, batch: list[can.Message]) -> None:
+        """Append frames as whole lines, or nothing of them; may raise OSError."""
         is_full = self._part_mb is not None and self._bytes >= 1e6 * self._part_mb
         if self._descriptor < 0 or is_full:
             self._next_part()
@@ -194,10 +183,9 @@ class _RecordFile:
                 os.lseek(self._descriptor, self._bytes, os.SEEK_SET)
             raise
         self._bytes += len(data)
-        self.written_bytes += len(data)
+        self._written_bytes += len(data)
 
-    def close(self) -> None:
-        """Close the file."""
+    def _close_file(self) -> None:
         if self._descriptor >= 0:
             descriptor = self._descriptor
             self._descriptor = -1
@@ -205,13 +193,13 @@ class _RecordFile:
 
     def _next_part(self) -> None:
         part = self._part + 1
-        self.current = part_path(self._base, self._run, part) if self._in_parts else self._base
+        self._current = part_path(self._base, self._run, part) if self._in_parts else self._base
         self._remove_oldest()
-        self.close()
+        self._close_file()
         # Made anew: another user may have made a file or a link of this name.
         flags = os.O_WRONLY | os.O_CLOEXEC | os.O_CREAT | os.O_EXCL
         # The group may read where and how the car was driven, others not.
-        self._descriptor = os.open(self.current, flags, 0o640)
+        self._descriptor = os.open(self._current, flags, 0o640)
         self._part = part
         self._bytes = 0
         self._text = io.StringIO(newline="")
@@ -230,6 +218,10 @@ class _RecordFile:
             path.unlink(missing_ok=True)
             total -= size
             emit(_LOG.info, "record.removed", f"removed the oldest part: {path}")
+
+
+def _failed(error: Exception) -> None:
+    _emit_state(_LOG.error, "record.failed", f"recording: {error}")
 
 
 def check_recording(path: Path, part_mb: float | None, keep_mb: float | None) -> None:
