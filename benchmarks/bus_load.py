@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -192,7 +193,7 @@ def timing(seconds: float = 120.0) -> list[Row]:
         path = Path(folder) / "capture.log"
         rng = np.random.default_rng(1)
         stamps = np.sort(rng.uniform(0.0, seconds, int(200 * seconds) - 2))
-        with Recorder(path) as recorder:
+        with closing(Recorder(path)) as recorder:
             for stamp in [0.0, *stamps.tolist(), seconds]:
                 recorder.on_frame(
                     can.Message(timestamp=1.7e9 + stamp, arbitration_id=0x1F2, is_extended_id=False)

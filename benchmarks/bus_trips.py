@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -104,7 +105,7 @@ def over_bus(
     with (
         BusConnection(bus, address) as receiver,
         BusConnection(open_bus(address, [standard_filter(0x5A1)]), address) as sender,
-        Recorder(record) as recorder,
+        closing(Recorder(record)) as recorder,
     ):
         outputs = [_Rows(rows), recorder]
         loop = Loop(receiver, pipeline, RunConfig(model="-"), outputs=outputs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import can
@@ -46,7 +47,7 @@ def estimates_from_64_bytes(address: BusAddress, folder: Path) -> None:
     car, path = fd_vehicle(folder), folder / "fd.log"
     pipeline = Pipeline(car, leaf_model(), PipelineSettings())
     with (
-        Recorder(path) as recorder,
+        closing(Recorder(path)) as recorder,
         BusConnection(open_bus(address, pipeline.filters), address) as port,
         Service(port, pipeline, loop_config(), recorder) as live,
         open_bus(address, []) as sender,

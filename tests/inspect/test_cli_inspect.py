@@ -109,7 +109,7 @@ def test_a_capture_is_shown_in_eighty_columns_with_the_next_step(tmp_path: Path)
     shown = CliRunner().invoke(app, [str(path)]).stdout
     assert "drive.log: candump log, 201 frames of 2 ids, 30.0 s, from 2023-11-14 22:13:20" in shown
     assert f"No known vehicle. Find its signals: cangauge init {path} -o mycar" in shown
-    assert re.search(r"1F0 . +200 . +2 . +0.1 . ", shown)
+    assert re.search(r"1F0 . +can0 . +200 . +2 . +0.1 . ", shown)
     assert "period [s]" in shown
     assert "Silence of 10.1 s after 19.9 s" in shown
     assert all(len(line) <= 80 for line in shown.splitlines() if ": " not in line)

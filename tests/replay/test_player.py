@@ -8,6 +8,7 @@ import random
 import re
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -325,7 +326,7 @@ def test_a_loop_runs_until_stopped() -> None:
 
 def test_full_speed_needs_the_vehicle_of_a_capture(tmp_path: Path) -> None:
     path = tmp_path / "a.log"
-    with Recorder(path) as recorder:
+    with closing(Recorder(path)) as recorder:
         recorder.on_frame(can.Message(timestamp=1.0, arbitration_id=1, data=b"1"))
     with virtual_port("blind") as port, pytest.raises(InputError, match="--vehicle"):
         play(port, CaptureSource(path), **MAX, stop=never)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
@@ -25,7 +26,7 @@ def frame(time_s: float, frame_id: int = 0x123, data: bytes = b"\x01") -> can.Me
 
 
 def write(path: Path, frames: list[can.Message]) -> Path:
-    with Recorder(path) as recorder:
+    with closing(Recorder(path)) as recorder:
         for each in frames:
             recorder.on_frame(each)
     return path

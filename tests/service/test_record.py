@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def live_and_recorded(
 ) -> tuple[list[Estimate], Recorder]:
     """Handle frames as the loop does; return the estimates and the closed recorder."""
     live = []
-    with Recorder(path, part_mb) as recorder:
+    with closing(Recorder(path, part_mb)) as recorder:
         for number, message in enumerate(messages):
             recorder.on_frame(message)
             if part_mb and number % 100 == 0:
@@ -131,14 +132,14 @@ def test_a_recorded_replay_uses_the_logs_time(tmp_path: Path) -> None:
 
 
 def test_a_capture_of_another_bus_is_refused(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "other.log") as recorder:
+    with closing(Recorder(tmp_path / "other.log")) as recorder:
         recorder.on_frame(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
     with pytest.raises(InputError, match="no sample"):
         estimate_capture(recorder.written, Vehicle.load("generic"), leaf_model())
 
 
 def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "drive.log", part_mb=0.002) as recorder:
+    with closing(Recorder(tmp_path / "drive.log", part_mb=0.002)) as recorder:
         write(recorder, frames(20.0))
     arguments = (recorder.written, "--vehicle", "generic", "--json")
     ended = in_process("estimate", *arguments, "-m", leaf_model_path(), "-o", tmp_path / "soc.csv")
@@ -148,7 +149,7 @@ def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:
 def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
     names = ("drive.log", "drive-0001.log", "drive-0002.log")
     for number, name in enumerate(names):
-        with Recorder(tmp_path / "drive.log") as recorder:
+        with closing(Recorder(tmp_path / "drive.log")) as recorder:
             write(recorder, frames(1.0, 1.7e9 + 100.0 * number))
         assert recorder.written == tmp_path / name
     for number, name in enumerate(names):
@@ -157,7 +158,7 @@ def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
 
 def test_the_oldest_parts_are_removed(tmp_path: Path) -> None:
     for _ in range(3):
-        with Recorder(tmp_path / "drive.log", 0.004, 0.04) as recorder:
+        with closing(Recorder(tmp_path / "drive.log", 0.004, 0.04)) as recorder:
             write(recorder, frames(30.0))
     parts = all_parts(tmp_path / "drive.log")
     assert {run for run, _, _ in parts} <= {2, 3}
@@ -184,7 +185,7 @@ def test_impossible_recordings_are_refused(tmp_path: Path) -> None:
     for name in ("drive.asc", "drive.csv", "drive", "drive.gz"):
         with pytest.raises(InputError, match="candump"):
             check_recording(tmp_path / name, None, None)
-    with Recorder(tmp_path / "private.log"):
+    with closing(Recorder(tmp_path / "private.log")):
         pass
     assert (tmp_path / "private.log").stat().st_mode & 0o777 == 0o640 & ~_umask()
 
@@ -209,7 +210,7 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
 
     monkeypatch.setattr(record.os, "write", half)
     messages = frames(60.0)
-    with Recorder(tmp_path / "drive.log") as recorder:
+    with closing(Recorder(tmp_path / "drive.log")) as recorder:
         write(recorder, messages[:400])
         assert waits(lambda: recorder.state["frames"] == 400)
         is_full.set()
@@ -254,7 +255,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
     folder = tmp_path / "stick"
     folder.mkdir()
     messages = frames(20.0)
-    with Recorder(folder / "drive.log", part_mb=0.002) as recorder:
+    with closing(Recorder(folder / "drive.log", part_mb=0.002)) as recorder:
         write(recorder, messages[:100])
         assert waits(lambda: recorder.state["frames"] == 100)
         folder.rename(tmp_path / "gone")
@@ -271,9 +272,10 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
 
 CHILD = """
 import sys, time, can
+from contextlib import closing
 from cangauge.service.record import Recorder
 from cangauge.service.status_client import Snapshot
-with Recorder(sys.argv[1]) as recorder:
+with closing(Recorder(sys.argv[1])) as recorder:
     for number in range(100_000):
         recorder.on_frame(can.Message(
             timestamp=1.7e9 + 0.001 * number, arbitration_id=0x123, data=number.to_bytes(8, "big")

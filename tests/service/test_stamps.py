@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -39,7 +40,7 @@ def run(
     port = SimulatedPort(frames_every(0.02, seconds, stamp=stamp))
     port.address = KERNEL
     pipeline, rows = Pipeline(GENERIC, leaf_model(), GIVEN), Rows([])
-    with Recorder(path) as recorder, LoggedLines("cangauge.service.loop") as logged:
+    with closing(Recorder(path)) as recorder, LoggedLines("cangauge.service.loop") as logged:
         simulate(port, seconds, pipeline, outputs=[rows, recorder])
     recorded = estimate_capture(path, GENERIC, leaf_model(), GIVEN.estimator).table
     assert recorded.soc_pct.tolist() == [each.soc_pct for _, each in rows.rows]

@@ -45,7 +45,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     with (
         BusConnection(open_bus(VCAN, pipeline.filters), VCAN) as port,
         BusConnection(open_bus(VCAN, []), VCAN) as sender,
-        Recorder(tmp_path / "seen.log", part_mb=0.005) as recorder,
+        closing(Recorder(tmp_path / "seen.log", part_mb=0.005)) as recorder,
     ):
         monitor = Monitor(pipeline, port, recorder=recorder)
         server = Served(monitor.latest, http="127.0.0.1:0")

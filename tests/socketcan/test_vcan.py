@@ -7,6 +7,7 @@ import socket
 import struct
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,7 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
     log, vehicle, path = short_log(60.0), Vehicle.load("leaf_aze0"), tmp_path / "vcan0.log"
     estimator = EstimatorSettings(initial_soc_pct=80.0)
     settings = PipelineSettings(estimator, "replay-clock")
-    with Recorder(path) as recorder, service("leaf_aze0", settings, recorder) as live:
+    with closing(Recorder(path)) as recorder, service("leaf_aze0", settings, recorder) as live:
         state = play(replay_port, LogSource(log, vehicle), **MAX, stop=never)
     assert state.acknowledged == len(live.rows) == len(log)
     assert live.pipeline.counts["lost"] == live.pipeline.counts["crc_errors"] == 0
@@ -135,7 +136,10 @@ def test_a_log_at_full_speed_within_the_bound_and_bit_for_bit(
 
 def test_real_time_uses_the_kernels_stamps(replay_port: BusConnection, tmp_path: Path) -> None:
     log, path = short_log(6.01), tmp_path / "vcan0.log"
-    with Recorder(path) as recorder, service("generic", PipelineSettings(), recorder) as live:
+    with (
+        closing(Recorder(path)) as recorder,
+        service("generic", PipelineSettings(), recorder) as live,
+    ):
         state = play(replay_port, LogSource(log, Vehicle.load("generic")), stop=never)
         assert waits(lambda: live.pipeline.samples == len(log))
     assert state.seconds == pytest.approx(6.0, abs=0.1)

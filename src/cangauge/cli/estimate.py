@@ -278,7 +278,6 @@ def _show(name: str, found: Mapping[str, Any], table: EstimateTable) -> None:
     compared = "" if off is None else f"; {number(off, 2, '%')} off the log's own SoC on average"
     say(f"{name}: {soc_at(-1)} SoC at the end, from {start} ({_ORIGINS[origin]}){compared}.")
     values = {
-        "initial SoC": f"{start} ({_ORIGINS[origin]})",
         "SoC at the end": soc_at(-1),
         "SoC error, MAE": number(found["soc_mae_pct"], 2, "%"),
         "SoC error, largest": number(found["soc_max_pct"], 2, "%"),

@@ -184,7 +184,6 @@ def _show_capture(found: CaptureInspection) -> None:
 
 
 def _rows_of_ids(found: CaptureInspection) -> tuple[list[str], list[list[str]]]:
-    has_buses = len({each.bus for each in found.ids}) > 1
     rows = []
     for each in found.ids:
         counts = {words: getattr(each, name) for name, words in _FAULTS.items()}
@@ -192,7 +191,5 @@ def _rows_of_ids(found: CaptureInspection) -> tuple[list[str], list[list[str]]]:
         faults += ["two senders"] * each.two_senders
         seconds = ["–" if s is None else f"{s:.3g}" for s in (each.period_s, each.longest_s)]
         state = ", ".join(faults) or ("none" if each.protection else "not protected")
-        bus = [each.bus] if has_buses else []
-        rows.append([each.id, *bus, f"{each.frames:,}", each.bytes, *seconds, state])
-    bus = ["bus"] if has_buses else []
-    return ["id", *bus, "frames", "bytes", "period [s]", "longest [s]", "faults"], rows
+        rows.append([each.id, each.bus, f"{each.frames:,}", each.bytes, *seconds, state])
+    return ["id", "bus", "frames", "bytes", "period [s]", "longest [s]", "faults"], rows

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
-from cangauge._files import written_name
+from cangauge._files import is_own, written_name
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.worker import start_thread
@@ -111,8 +111,8 @@ def runtime_folders() -> list[Path]:
 def _is_anothers(folder: Path) -> bool:
     """Return whether a folder is another user's, who can replace the sockets in it."""
     try:
-        return folder.lstat().st_uid not in {0, os.geteuid()}
-    except (OSError, AttributeError):  # none there; Windows
+        return not is_own(folder.lstat())
+    except OSError:  # none there
         return False
 
 

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Final
 
@@ -93,7 +93,7 @@ async def _serve(endpoint: Path, config: RunConfig, bus: str) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     with ExitStack() as stack:
-        outputs = [stack.enter_context(each) for each in outputs_of(config, bus)]
+        outputs = [stack.enter_context(closing(each)) for each in outputs_of(config, bus)]
         os.nice(NICE)  # once it has started
         while True:
             began_s = time.monotonic()
