@@ -68,8 +68,7 @@ def schema_error(
     advice, for errors without a better one.
     """
     errors = error.errors(include_url=False)
-    unknown = [each for each in errors if each["type"] in _UNKNOWN_KEY]
-    first = (unknown or errors)[0]
+    first = next((each for each in errors if each["type"] in _UNKNOWN_KEY), errors[0])
     place = list(first["loc"])
     while len(place) > 1 and place[-1] in _UNION_TAGS:  # pydantic names the member of a union
         place.pop()

@@ -316,10 +316,9 @@ def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
     chosen = [info for info in files if info.filename.lower().endswith(_D3_MEMBER)] or files
     if len(chosen) != 1:
         names = ", ".join(info.filename for info in chosen[:4])
-        more = ", …" if len(chosen) > 4 else ""
         is_neware = any(info.filename == "data.ndc" for info in chosen)
         raise InputError(
-            f"the zip holds {len(chosen)} files ({names}{more})" if chosen else "the zip is empty",
+            f"the zip holds {len(chosen)} files ({names})" if chosen else "the zip is empty",
             source=path,
             cure="a Neware .ndax: convert it with NewareNDA: NewareNDA.read(file).to_csv('log.csv')"
             if is_neware

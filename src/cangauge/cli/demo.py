@@ -79,8 +79,11 @@ def demo_command(
             field="--folder",
             cure="name another one",
         ) from error
-    files = {"model": "model.json", "fit_page": "fit.html", "soc_page": "soc.html"}
-    paths = {name: folder / file for name, file in files.items()}
+    paths = {
+        "model": folder / "model.json",
+        "fit_page": folder / "fit.html",
+        "soc_page": folder / "soc.html",
+    }
     note("1/4  fit the voltage model to 2.6 h of the reconstructed Leaf test")
     identification = fit([open_log(shared_file("replay", TRAINED_ON)).read()], equation="published")
     model = identification.model

@@ -154,8 +154,9 @@ def estimate_command(
             write_table(pack_columns(done.pack_rows), pack)
     for warning in done.warnings:
         remark(f"warning: {done.recorded.source}: {warning}")
-    logs = [done.recorded] if isinstance(done.recorded, Log) else []
-    found = done.to_dict() | {"assumed": assumed_of(logs)}
+    found = done.to_dict() | {
+        "assumed": assumed_of([done.recorded] if isinstance(done.recorded, Log) else [])
+    }
     finish(
         found,
         partial(_show, done.recorded.name, found, done.table),
