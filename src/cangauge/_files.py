@@ -566,7 +566,7 @@ def text_sha256(text: str) -> str:
 
 def file_sha256(path: str | Path) -> str | None:
     """Return the SHA-256 of a file's bytes in hexadecimal; None if it is not a file."""
-    if not path or not Path(path).is_file():
+    if not Path(path).is_file():
         return None
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

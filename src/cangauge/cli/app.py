@@ -139,24 +139,24 @@ def main() -> None:
         code = app(standalone_mode=False, prog_name="cangauge")
         print_remarks()
     except CangaugeError as error:
-        sys.exit(_failed("" if error.logged else str(error), error.to_dict(), error.exit_code))
+        code = _failed("" if error.logged else str(error), error.to_dict(), error.exit_code)
     except UsageError as error:
         line, field = _usage(error)
-        sys.exit(_failed(line, {**CangaugeError(line).to_dict(), "field": field}, 2))
+        code = _failed(line, {**CangaugeError(line).to_dict(), "field": field}, 2)
     except OSError as error:
         if error.errno not in FULL:
             raise
         # Files are written elsewhere: this is stdout, into a file on a full disk.
         _discard_stdout()
-        sys.exit(_failed(f"stdout: {error.strerror}", {}, 1))
+        code = _failed(f"stdout: {error.strerror}", {}, 1)
     except Exception as error:
         # Of a library that is loaded: the words of the C library's loader.
-        if isinstance(error, MemoryError) or "failed to map segment" in str(error):
-            line = "the memory limit is reached; raise it (ulimit -v, MemoryMax=)"
-            sys.exit(_failed(line, CangaugeError(line).to_dict(), 1))
-        # A bug: Python prints the traceback and exits with 1.
-        _failed("", CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
-        raise
+        if not (isinstance(error, MemoryError) or "failed to map segment" in str(error)):
+            # A bug: Python prints the traceback and exits with 1.
+            _failed("", CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
+            raise
+        line = "the memory limit is reached; raise it (ulimit -v, MemoryMax=)"
+        code = _failed(line, CangaugeError(line).to_dict(), 1)
     if code == 130:  # typer's code for Ctrl-C
         note("stopped")
     sys.exit(code or 0)
