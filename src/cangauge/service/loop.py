@@ -10,6 +10,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import Final
 
@@ -42,6 +43,7 @@ _REASONS: Final = {
 """Reasons in the frames while something is wrong, by event."""
 
 
+@dataclass(eq=False)
 class Loop:
     """The receive loop.
 
@@ -65,24 +67,19 @@ class Loop:
     receiving are steady ones (`steady_s`), which count a suspended machine too, as stamps do.
     """
 
-    def __init__(
-        self,
-        port: BusConnection,
-        pipeline: Pipeline,
-        config: RunConfig,
-        *,
-        outputs: Sequence[Output] = (),
-        monitor: Monitor | None = None,
-        checkpoint: Callable[[], None] | None = None,
-        reload: Callable[[], RunConfig | None] | None = None,
-    ) -> None:
-        self._port = port
-        self._pipeline = pipeline
-        self._config = config
-        self._outputs = list(outputs)  # those that still take news
-        self._monitor = monitor or Monitor(pipeline, port)
-        self._checkpoint = checkpoint
-        self._reload = reload
+    port: BusConnection
+    pipeline: Pipeline
+    config: RunConfig
+    _: KW_ONLY
+    outputs: Sequence[Output] = ()
+    monitor: Monitor | None = None
+    checkpoint: Callable[[], None] | None = None
+    reload: Callable[[], RunConfig | None] | None = None
+
+    def __post_init__(self) -> None:
+        port = self.port
+        self._outputs = list(self.outputs)  # those that still take news
+        self._monitor = self.monitor or Monitor(self.pipeline, port)
         self._published = OwnFrames(echoes=port.address.echoes)
         self._requested = OwnFrames(echoes=port.address.echoes)
         self._stamps_are_arrival = port.address.stamps != "driver"
@@ -98,7 +95,7 @@ class Loop:
         self._configure()
         self._began_s = self._now_s = time.monotonic()
         self._publish_due_s = self._housekeep_due_s = self._began_s
-        self._save_due_s = self._began_s + min(FIRST_CHECKPOINT_S, config.state_every_s)
+        self._save_due_s = self._began_s + min(FIRST_CHECKPOINT_S, self.config.state_every_s)
         # When the latest sample was processed, and when the frames of the latest one that the
         # estimator took arrived: they may have waited in the socket, under load or suspended.
         self._last_sample_s = self._last_arrival_s = self._began_s
@@ -109,8 +106,8 @@ class Loop:
         The filters also pass ids that show other senders: published frames, requests and
         REPLAY_CLOCK. `_others` has what to do with each.
         """
-        pipeline = self._pipeline
-        poll = self._config.poll
+        pipeline = self.pipeline
+        poll = self.config.poll
         poller = self._poller
         targets = pipeline.vehicle.poll_targets
         ids = pipeline.settings.ids
@@ -124,7 +121,7 @@ class Loop:
             self._monitor.polls = poller.counts
             self._others |= dict.fromkeys(poller.request_ids, self._note_request)
         self._others |= dict.fromkeys(ids.published, self._note_published)
-        self._port.set_filters([*pipeline.filters, *map(standard_filter, sorted(self._others))])
+        self.port.set_filters([*pipeline.filters, *map(standard_filter, sorted(self._others))])
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Receive, estimate and publish until `stop()`, called every `ESTIMATE_EVERY_S` or sooner.
@@ -137,9 +134,9 @@ class Loop:
         try:
             while not (stop() or self._is_over()):
                 self._iterate()
-            if self._pipeline.finish():
-                self._give_sample(self._pipeline.latest)
-            if self._pipeline.published_samples != self._pipeline.samples:
+            if self.pipeline.finish():
+                self._give_sample(self.pipeline.latest)
+            if self.pipeline.published_samples != self.pipeline.samples:
                 self._now_s = time.monotonic()
                 self._publish_periodic()  # a sample that waited counts as silence
         finally:
@@ -147,27 +144,27 @@ class Loop:
 
     def _is_over(self) -> bool:
         """Return whether the run's duration has passed, or no sample came for too long."""
-        duration_s = self._config.duration_s
-        idle_s = self._config.until_idle_s
+        duration_s = self.config.duration_s
+        idle_s = self.config.until_idle_s
         if duration_s is not None and self._now_s - self._began_s >= duration_s:
             return True
         is_idle = idle_s is not None and self._now_s - self._last_sample_s >= idle_s
-        return is_idle and self._pipeline.samples > 0
+        return is_idle and self.pipeline.samples > 0
 
     def _iterate(self) -> None:
         """Receive once, process the frames, and do what is due."""
         left_s = self._publish_due_s + LATE_S - self._now_s
-        messages = self._port.receive_pending(min(max(left_s, 0.0), ESTIMATE_EVERY_S))
+        messages = self.port.receive_pending(min(max(left_s, 0.0), ESTIMATE_EVERY_S))
         # Reading the clock may be a system call: once per step, and again after samples.
-        self._now_s, before, received_s = time.monotonic(), self._pipeline.samples, steady_s()
+        self._now_s, before, received_s = time.monotonic(), self.pipeline.samples, steady_s()
         if messages:
             self._process(messages, received_s)
-        if self._port.is_drained:
+        if self.port.is_drained:
             self._last_drained_s = self._last_received_s
             for sent in (self._published, self._requested):
                 sent.forget(self._last_received_s)
         self._last_received_s = received_s
-        late_s = 0.0 if self._pipeline.samples != before else LATE_S
+        late_s = 0.0 if self.pipeline.samples != before else LATE_S
         if self._now_s >= self._publish_due_s + late_s:
             self._publish_periodic()
         if self._poller is not None:
@@ -180,7 +177,7 @@ class Loop:
 
     def _process(self, messages: list[can.Message], received_s: float) -> None:
         """Estimate from frames that were received together at a steady time [s]."""
-        pipeline = self._pipeline
+        pipeline = self.pipeline
         began_s = self._now_s
         samples = pipeline.samples
         taken = pipeline.taken
@@ -207,12 +204,12 @@ class Loop:
         self._give("on_frame", message)
         if self._poller is not None and message.arbitration_id in self._poller.reply_ids:
             self._ask(self._poller.take(message, self._now_s))
-        if not self._pipeline.handle(message):
+        if not self.pipeline.handle(message):
             return False
-        if self._outputs or self._pipeline.is_replay:
-            estimate = self._pipeline.latest
+        if self._outputs or self.pipeline.is_replay:
+            estimate = self.pipeline.latest
             self._give_sample(estimate)
-            if frames := self._pipeline.replay_frames(estimate):
+            if frames := self.pipeline.replay_frames(estimate):
                 self._send(frames)
                 self._publish_due_s = self._now_s + ESTIMATE_EVERY_S
         return True
@@ -245,7 +242,7 @@ class Loop:
             )
 
     def _give_sample(self, estimate: Estimate) -> None:
-        self._give("on_sample", self._pipeline.latest_sample, estimate)
+        self._give("on_sample", self.pipeline.latest_sample, estimate)
 
     def _give(self, method: str, *news: object) -> None:
         """Give the outputs some news.
@@ -272,9 +269,9 @@ class Loop:
         if self._published.is_shared(self._now_s):
             reasons.add(Reason.DUPLICATE_SENDER)
         self._send(
-            self._pipeline.heartbeat(
+            self.pipeline.heartbeat(
                 self._now_s - self._last_arrival_s,
-                self._config.timeout_s,
+                self.config.timeout_s,
                 Reason(sum(reasons)),
             )
         )
@@ -284,8 +281,8 @@ class Loop:
 
     def _follow_clock(self) -> None:
         """Let the pipeline follow a step of the stamps' clock, and log it."""
-        step_s = self._pipeline.stamp_shift_s - self._stamps.shift_s
-        self._pipeline.stamp_shift_s = self._stamps.shift_s
+        step_s = self.pipeline.stamp_shift_s - self._stamps.shift_s
+        self.pipeline.stamp_shift_s = self._stamps.shift_s
         if abs(step_s) >= 1.0:  # smaller ones are the clock's drift
             _warn(
                 "bus.clock_set",
@@ -296,7 +293,7 @@ class Loop:
 
     def _find(self) -> dict[str, str]:
         """Return what is wrong with time and signals at present: a sentence by event."""
-        decoder = self._pipeline.decoder
+        decoder = self.pipeline.decoder
         found = dict[str, str]()
         if self._stamps.is_uncertain(steady_s()):
             found["bus.time_uncertain"] = (
@@ -310,9 +307,9 @@ class Loop:
                 " the DBC states, give its shortest period_s in the map file; with j1939 = true,"
                 " number it in the DBC with the pack's source address, and remove that line)"
             )
-        if self._pipeline.is_unpaired:
+        if self.pipeline.is_unpaired:
             found["bus.unpaired"] = (
-                f"voltages come, but not within {self._pipeline.vehicle.pair_within_s:g} s of a"
+                f"voltages come, but not within {self.pipeline.vehicle.pair_within_s:g} s of a"
                 " current: they are not used; give a longer pair_within_s in the map file"
             )
         if decoder.unsigned_current is not None:
@@ -342,30 +339,30 @@ class Loop:
         estimate.
         """
         sent.note_sent(frame, steady_s())
-        self._port.post(frame, ESTIMATE_EVERY_S)
+        self.port.post(frame, ESTIMATE_EVERY_S)
 
     # --- housekeeping
 
     def _save(self) -> None:
-        if self._checkpoint is not None:
-            self._checkpoint()
+        if self.checkpoint is not None:
+            self.checkpoint()
 
     def _housekeep(self) -> None:
         """Report lost frames, save, reload and show."""
         now_s = self._now_s
-        drops = self._port.queue_drops or 0
+        drops = self.port.queue_drops or 0
         if drops > self._drops:
             _warn(
                 "bus.queue_overflow",
-                f"{self._port.name}: the receive queue overflowed: {drops - self._drops} frames"
+                f"{self.port.name}: the receive queue overflowed: {drops - self._drops} frames"
                 f" lost ({drops} so far)",
             )
             self._drops = drops
         if now_s >= self._save_due_s:
-            self._save_due_s = now_s + self._config.state_every_s
+            self._save_due_s = now_s + self.config.state_every_s
             self._save()
-        if self._reload is not None and (config := self._reload()) is not None:
-            self._config = config
+        if self.reload is not None and (config := self.reload()) is not None:
+            self.config = config
             self._save_due_s = min(self._save_due_s, now_s + config.state_every_s)
             self._configure()
         if self._monitor.update(now_s):

@@ -14,6 +14,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
@@ -101,6 +102,7 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
     return path
 
 
+@dataclass(eq=False)
 class StateKeeper:
     """Restore the state at the start, save it on request and at the end; use it in a `with` block.
 
@@ -108,47 +110,41 @@ class StateKeeper:
     `wall_s` gives Unix time [s]; `restored` is whether the estimator continued from the file.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        pipeline: Pipeline,
-        bus: str,
-        max_age_s: float,
-        wall_s: Callable[[], float] = time.time,
-    ) -> None:
-        self._path = path
-        self._bus = bus
-        self._pipeline = pipeline
-        self._max_age_s = max_age_s
-        self._wall_s = wall_s
+    path: Path
+    pipeline: Pipeline
+    bus: str
+    max_age_s: float
+    wall_s: Callable[[], float] = time.time
+
+    def __post_init__(self) -> None:
         self._boot_id = _boot_id()
         self._worker = Worker("cangauge-state", self._failed, jobs_at_most=3)
-        self._hashed = (pipeline.model, text_sha256(pipeline.model.to_json()))
+        self._hashed = (self.pipeline.model, text_sha256(self.pipeline.model.to_json()))
         self._samples_kept = 0
         self.restored = False
 
     def __enter__(self) -> Self:
-        remove_parts(self._path)
-        if not os.path.exists(self._path):  # noqa: PTH110 - never raises
-            emit(_LOG.info, "state.none", f"{self._path}: no saved state; starting without one")
+        remove_parts(self.path)
+        if not os.path.exists(self.path):  # noqa: PTH110 - never raises
+            emit(_LOG.info, "state.none", f"{self.path}: no saved state; starting without one")
             return self
         try:
-            if not is_own(written_name(self._path).lstat()):  # a link of another user, or his file
-                raise InputError("belongs to another user", source=self._path)  # noqa: TRY301
-            content = read_state(self._path)
+            if not is_own(written_name(self.path).lstat()):  # a link of another user, or his file
+                raise InputError("belongs to another user", source=self.path)  # noqa: TRY301
+            content = read_state(self.path)
             age_s = self._age_s(content)
-            latest = self._pipeline.restore(content.estimator, age_s)
+            latest = self.pipeline.restore(content.estimator, age_s)
         except InputError as error:
             self._set_aside(error)
             return self
         self.restored = True
         ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
-        if content.estimator.writer != self._pipeline.estimator.writer:
+        if content.estimator.writer != self.pipeline.estimator.writer:
             ago += ", of another release, method or capacity, of which the SoC alone is kept"
         emit(
             _LOG.info,
             "state.restored",
-            f"{self._path}: continuing from a state {ago}: SoC"
+            f"{self.path}: continuing from a state {ago}: SoC"
             f" {known_soc(latest.soc_pct, latest.soc_std_pct, 2)}",
         )
         return self
@@ -159,17 +155,17 @@ class StateKeeper:
             emit(
                 _LOG.warning,
                 "state.failed",
-                f"{self._path}: the last state was not written in time",
+                f"{self.path}: the last state was not written in time",
             )
 
     def checkpoint(self) -> None:
         """Start saving the state if it has new samples; return at once."""
-        pipeline = self._pipeline
+        pipeline = self.pipeline
         if pipeline.samples == self._samples_kept or (state := pipeline.snapshot()) is None:
             return
         content = StateContent.model_construct(
             **self._uses(),
-            saved_s=self._wall_s(),
+            saved_s=self.wall_s(),
             boot_id=self._boot_id,
             model_name=pipeline.model.name,
             vehicle_name=pipeline.vehicle.name,
@@ -180,19 +176,19 @@ class StateKeeper:
 
     def _uses(self) -> dict[str, Any]:
         """Return what a state belongs to."""
-        pipeline = self._pipeline
+        pipeline = self.pipeline
         if pipeline.model is not self._hashed[0]:  # the configuration was reloaded
             self._hashed = (pipeline.model, text_sha256(pipeline.model.to_json()))
         return {
             "model": self._hashed[1],
             "battery": text_sha256(pipeline.vehicle.battery),
-            "bus": self._bus,
+            "bus": self.bus,
             "time_source": pipeline.settings.time_source,
         }
 
     def _age_s(self, content: StateContent) -> float:
         """Return the age of a state that may be used [s]; NaN: unknown. Else raise InputError."""
-        path = self._path
+        path = self.path
         names = {"model": content.model_name, "battery": content.vehicle_name}
         for field, wanted in self._uses().items():
             if (owner := getattr(content, field)) != wanted:
@@ -203,8 +199,8 @@ class StateKeeper:
                 )
         if content.time_source == "replay-clock":
             return 0.0
-        age_s = self._wall_s() - content.saved_s
-        limit_s = self._max_age_s
+        age_s = self.wall_s() - content.saved_s
+        limit_s = self.max_age_s
         if age_s > limit_s:
             raise InputError(
                 f"{age_s / 3600.0:.1f} h old, more than the limit of {limit_s / 3600.0:g} h",
@@ -215,9 +211,9 @@ class StateKeeper:
         return max(age_s, REBOOT_S if content.boot_id != self._boot_id else 0.0)
 
     def _set_aside(self, error: InputError) -> None:
-        aside = self._path.with_name(f"{self._path.name}.refused")
+        aside = self.path.with_name(f"{self.path.name}.refused")
         try:
-            self._path.replace(aside)
+            self.path.replace(aside)
             kept = f"; kept as {aside.name}"
         except OSError as problem:
             kept = f" (and cannot be renamed: {problem.strerror})"
@@ -225,16 +221,16 @@ class StateKeeper:
         # a wide standard deviation that SoC would add nothing to the voltage, and Coulomb counting
         # would never correct it.
         how = "without one"
-        if self._pipeline.discard_initial_soc():
+        if self.pipeline.discard_initial_soc():
             how = "from the voltage, since the given initial SoC is outdated"
         emit(_LOG.warning, "state.refused", f"state refused: {error}{kept}; starting {how}")
 
     def _write(self, content: StateContent) -> None:
-        with atomic_path(self._path, rights=0o600) as part:
+        with atomic_path(self.path, rights=0o600) as part:
             part.write_text(state_text(content), encoding="utf-8")
 
     def _failed(self, error: Exception) -> None:
-        emit(_LOG.warning, "state.failed", f"state not written: {self._path}: {error}")
+        emit(_LOG.warning, "state.failed", f"state not written: {self.path}: {error}")
 
 
 def state_text(content: StateContent) -> str:

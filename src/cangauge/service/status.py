@@ -11,6 +11,7 @@ import math
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Final, get_args
 
@@ -91,6 +92,7 @@ def _as_utf8(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
+@dataclass(eq=False)
 class Monitor:
     """Collect counts in the receive loop; its methods are for the loop's thread.
 
@@ -101,29 +103,20 @@ class Monitor:
     gives monotonic time [s].
     """
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        port: BusConnection,
-        model: str = "",
-        *,
-        notifier: Notifier | None = None,
-        recorder: Recorder | None = None,
-        outputs: Sequence[Output] = (),
-        clock: Callable[[], float] = time.monotonic,
-        sign_cure: str = "set the other sign under [current] of the map file",
-    ) -> None:
-        self.model = model
-        self.sign_cure = sign_cure
+    pipeline: Pipeline
+    port: BusConnection
+    model: str = ""
+    _: KW_ONLY
+    notifier: Notifier = field(default_factory=Notifier)
+    recorder: Recorder | None = None
+    outputs: Sequence[Output] = ()
+    clock: Callable[[], float] = time.monotonic
+    sign_cure: str = "set the other sign under [current] of the map file"
+
+    def __post_init__(self) -> None:
         self.foreign = 0
         self.polls: dict[str, int] | None = None
-        self._pipeline = pipeline
-        self._port = port
-        self._notifier = notifier or Notifier()
-        self._recorder = recorder
-        self._outputs = outputs
-        self._clock = clock
-        self._began_s = now_s = clock()
+        self._began_s = now_s = self.clock()
         self._latency = Histogram()
         self._step = Histogram()
         self._due_s = self._notify_s = self._report_due_s = now_s
@@ -139,7 +132,7 @@ class Monitor:
 
     def now(self) -> dict[str, Any]:
         """Return the latest object with the ages of this moment; from any thread."""
-        return self.latest.at(self._clock())
+        return self.latest.at(self.clock())
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
         """Count a step of the estimator, of `step_s` [s].
@@ -162,13 +155,13 @@ class Monitor:
     def reload_begins(self) -> None:
         """Report a reload; `reload_ends` ends it."""
         self._config = self._config | {"reloading": True}
-        self._notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
+        self.notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
 
     def reload_ends(self, problem: str | None) -> None:
         """Report the end of a reload, and why it was refused; None if it was not."""
         self._config = {"reloading": False, "problem": problem}
         refused = "" if problem is None else f"; new configuration REFUSED: {problem}"
-        self._notifier.send(READY=1, STATUS=self._line() + refused)
+        self.notifier.send(READY=1, STATUS=self._line() + refused)
 
     def update(self, now_s: float) -> bool:
         """Record an iteration of the loop (monotonic time [s]); return whether `latest` is new."""
@@ -176,23 +169,23 @@ class Monitor:
             return False
         self._due_s = now_s + SHOW_EVERY_S
         self.latest = Snapshot(now_s, self._object(now_s))
-        self._log_changes(self._pipeline.published)
+        self._log_changes(self.pipeline.published)
         release_held()
-        self._notifier.send(WATCHDOG=1)  # ignored where the unit has no watchdog
-        if self._notifier.active and now_s >= self._notify_s:
+        self.notifier.send(WATCHDOG=1)  # ignored where the unit has no watchdog
+        if self.notifier.active and now_s >= self._notify_s:
             self._notify_s = now_s + NOTIFY_EVERY_S
-            self._notifier.send(STATUS=self._line())
+            self.notifier.send(STATUS=self._line())
         return True
 
     def final(self) -> dict[str, Any]:
         """Return the object of `/status` after the run, with the estimate published last."""
         self._report_due_s = -math.inf
-        return self._object(self._clock()) | {"running": False}
+        return self._object(self.clock()) | {"running": False}
 
     def _object(self, now_s: float) -> dict[str, Any]:
         """Return the object of `/status`."""
-        pipeline = self._pipeline
-        port = self._port
+        pipeline = self.pipeline
+        port = self.port
         estimate = pipeline.published
         sample = pipeline.latest_sample
         samples = pipeline.samples
@@ -209,8 +202,8 @@ class Monitor:
         rejected = sum(count for name, count in rejects.items() if name not in _OF_VALUES)
         counts = {name: getattr(port, name, None) for name in BUS_COUNTS}
         counts["foreign"] = self.foreign
-        record = None if self._recorder is None else self._recorder.state
-        troubles = [text for each in self._outputs if (text := each.trouble)]
+        record = None if self.recorder is None else self.recorder.state
+        troubles = [text for each in self.outputs if (text := each.trouble)]
         return {
             "schema": SCHEMA,
             "running": True,
@@ -255,7 +248,7 @@ class Monitor:
 
     def _line(self) -> str:
         """Return the status in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
-        estimate = self._pipeline.published
+        estimate = self.pipeline.published
         why = reason_sentences(int(estimate.reasons))
         status = estimate.status.name.lower() + (f" ({why})" if why else "")
         soc = known_soc(estimate.soc_pct, estimate.soc_std_pct, 1)
@@ -264,7 +257,7 @@ class Monitor:
     def _find_notices(self) -> dict[str, str]:
         """Return what the user should look after, by event: one sentence each."""
         found = {"cells.sum_differs": " ".join(self._report["notices"])}
-        if self._pipeline.latest.reasons & Reason.SIGN_SUSPECT:
+        if self.pipeline.latest.reasons & Reason.SIGN_SUSPECT:
             found["sign.suspect"] = (
                 f"{REASON_WORDS[Reason.SIGN_SUSPECT]}; the SoC is wrong. Positive current must"
                 f" discharge: {self.sign_cure}"
