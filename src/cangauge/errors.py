@@ -106,7 +106,7 @@ def located(source: str | PathLike[str] | None, field: str = "") -> Iterator[Non
         ) from error
 
 
-_OPTION: Final = re.compile("--([a-z]+(?:-[a-z]+)*)")
+_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?=['\d]))?")
 _ARGUMENTS: Final = {
     "temperature": "temperature_c",
     "initial-soc": "initial_soc_pct",
@@ -123,7 +123,8 @@ def naming_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Let the errors of a function of Python name its arguments in place of the options."""
 
     def argument(option: re.Match[str]) -> str:
-        return _ARGUMENTS.get(option[1], option[1].replace("-", "_"))
+        name = _ARGUMENTS.get(option[1], option[1].replace("-", "_"))
+        return f"{name}=" if option[2] else name
 
     def named(text: str | None) -> str | None:
         return text and _OPTION.sub(argument, text)
