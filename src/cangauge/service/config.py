@@ -29,6 +29,7 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Field,
     FiniteFloat,
     PrivateAttr,
     StrictBool,
@@ -69,6 +70,10 @@ def key(default: Any, text: str, option: str = "", metavar: str = "", **more: An
     """Return the field of a key with its default; further arguments as of `setting`."""
     about = {"option": option, "metavar": metavar} if option else {}
     return setting(text, default=default, **about, **more)
+
+
+Positive = Annotated[FiniteFloat, Field(gt=0.0, le=1e9)]
+"""A number that is not zero, in any unit."""
 
 
 class PollConfig(BaseModel, extra="forbid", frozen=True):
@@ -251,8 +256,10 @@ class RunConfig(BaseModel):
         "receive|replay-clock",
         restart=True,
     )
-    timeout_s: FiniteFloat = key(
-        2.0, "Time without a sample after which the input is stale.", unit="s", gt=0.0, le=1e9
+    timeout_s: Positive = key(
+        2.0,
+        "Time without a sample after which the input is stale.",
+        unit="s",
     )
     ids: FrameIds = key(FrameIds(), "Ids of the published frames.")
     record: str | None = key(
@@ -267,29 +274,27 @@ class RunConfig(BaseModel):
         restart=True,
         is_path=True,
     )
-    record_part_mb: FiniteFloat | None = key(
+    record_part_mb: Positive | None = key(
         None,
         "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
         unit="MB",
         restart=True,
-        gt=0.0,
-        le=1e9,
     )
-    record_keep_mb: FiniteFloat | None = key(
+    record_keep_mb: Positive | None = key(
         None,
         "Total size of the recording; the oldest files are removed.",
         unit="MB",
         restart=True,
-        gt=0.0,
-        le=1e9,
     )
-    duration_s: FiniteFloat | None = key(None, "Stop after this time.", unit="s", gt=0.0, le=1e9)
-    until_idle_s: FiniteFloat | None = key(
+    duration_s: Positive | None = key(
+        None,
+        "Stop after this time.",
+        unit="s",
+    )
+    until_idle_s: Positive | None = key(
         None,
         "Stop when no sample came for this time, after the first.",
         unit="s",
-        gt=0.0,
-        le=1e9,
     )
     state: str | None = key(
         None,
@@ -301,13 +306,11 @@ class RunConfig(BaseModel):
         is_path=True,
         default_text="systemd's StateDirectory, if there is one",
     )
-    state_max_age_s: FiniteFloat = key(
+    state_max_age_s: Positive = key(
         7.0 * 86400.0,
         "Age above which the state is refused.",
         unit="s",
         restart=True,
-        gt=0.0,
-        le=1e9,
     )
     state_every_s: FiniteFloat = key(
         # A service that is killed and restarts within three seconds misses less than half a minute
