@@ -388,9 +388,7 @@ def atomic_path(path: str | PathLike[str], rights: int = 0o666) -> Iterator[Path
             info = os.fstat(descriptor)
         if not has_name(info, part):
             raise InputError(
-                "another user has exchanged it meanwhile",
-                source=path,
-                cure="name another folder",
+                "another user has exchanged it meanwhile", source=path, cure="name another folder"
             )
         part.replace(target)
     except OSError as error:
@@ -434,9 +432,7 @@ def written_name(path: str | PathLike[str]) -> Path:
             if not left:
                 return name
             raise InputError(
-                f"{name} is a link of another user",
-                source=path,
-                cure="name the folder itself",
+                f"{name} is a link of another user", source=path, cure="name the folder itself"
             )
         links += 1
         if links > LINKS_AT_MOST:

@@ -15,12 +15,7 @@ from collections.abc import Callable
 
 
 def emit(
-    log: Callable[..., None],
-    event: str,
-    text: str,
-    *,
-    limit: str | None = None,
-    **fields: object,
+    log: Callable[..., None], event: str, text: str, *, limit: str | None = None, **fields: object
 ) -> None:
     """Log one event by a method of a logger: its stable name, and one line for people.
 

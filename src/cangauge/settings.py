@@ -123,8 +123,7 @@ ValidStdPct = Annotated[
     ),
 ]
 CapacityAh = Annotated[
-    FiniteFloat,
-    setting("Capacity.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5),
+    FiniteFloat, setting("Capacity.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5)
 ]
 VoltageAccuracyPct = Annotated[
     FiniteFloat,
@@ -182,8 +181,7 @@ class LongRest:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     after_s: Annotated[
-        FiniteFloat,
-        setting("Least duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0),
+        FiniteFloat, setting("Least duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0)
     ] = 7200.0
     soc_std_pct: Annotated[
         FiniteFloat,

@@ -48,11 +48,7 @@ def _order(command: EntryPoint) -> tuple[int, str]:
 
 
 COMMANDS: Final = {
-    command.name: command
-    for command in sorted(
-        entry_points(group="cangauge.commands"),
-        key=_order,
-    )
+    command.name: command for command in sorted(entry_points(group="cangauge.commands"), key=_order)
 }
 """The installed commands by name."""
 

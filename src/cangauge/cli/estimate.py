@@ -157,12 +157,7 @@ def estimate_command(
     found = done.to_dict() | {
         "assumed": assumed_of([done.recorded] if isinstance(done.recorded, Log) else [])
     }
-    finish(
-        found,
-        partial(_show, done.recorded.name, found, done.table),
-        files,
-        as_json=json_output,
-    )
+    finish(found, partial(_show, done.recorded.name, found, done.table), files, as_json=json_output)
 
 
 def estimate_file(
@@ -186,12 +181,7 @@ def estimate_file(
 
         if not isinstance(reading.open(path), LogFile):
             done = estimate_capture(
-                path,
-                reading.car_of(path),
-                model,
-                settings,
-                keeps_pack=keeps_pack,
-                progress=show,
+                path, reading.car_of(path), model, settings, keeps_pack=keeps_pack, progress=show
             )
         else:
             log = reading.load(path)

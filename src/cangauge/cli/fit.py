@@ -210,12 +210,7 @@ def fit_command(
             texts[report] = extra("report.fit:fit_page")(result).html()
         write_texts_atomic(texts)
     found = result.to_dict() | {"assumed": assumed_of(recorded)}
-    finish(
-        found,
-        partial(_show, result),
-        {"model": output, "report": report},
-        as_json=json_output,
-    )
+    finish(found, partial(_show, result), {"model": output, "report": report}, as_json=json_output)
 
 
 def _cells_of(log: Log, reading: ReadingOptions) -> int | None:

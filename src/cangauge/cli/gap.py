@@ -66,12 +66,7 @@ def gap_command(
     capacity_ah: CapacityAh = None,
     extended: Annotated[
         Path | None,
-        option(
-            "--extended",
-            "MODEL.json",
-            "Write the corrected model.",
-            suffixes=(".json",),
-        ),
+        option("--extended", "MODEL.json", "Write the corrected model.", suffixes=(".json",)),
     ] = None,
     simulated: Annotated[
         str | None,
@@ -102,12 +97,7 @@ def gap_command(
         ),
     ] = ALARM,
     plan: Annotated[
-        bool,
-        option(
-            "--plan",
-            "",
-            "Print what the next measurement is expected to bring.",
-        ),
+        bool, option("--plan", "", "Print what the next measurement is expected to bring.")
     ] = False,
     add_test: Annotated[
         list[Path] | None,

@@ -14,14 +14,7 @@ from rich.console import RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from cangauge._text import (
-    NONE_KNOWN,
-    energy_text,
-    known_soc,
-    number,
-    possible,
-    uncertain,
-)
+from cangauge._text import NONE_KNOWN, energy_text, known_soc, number, possible, uncertain
 from cangauge.cli.options import Json, option
 from cangauge.cli.output import (
     PlainConsole,
@@ -69,12 +62,7 @@ def status_command(
 
     `cangauge status --endpoint /run/cangauge/can0/socketcan-can0.sock --json`
     """
-    from cangauge.service.status_client import (
-        NotRunningError,
-        fetch_status,
-        find_socket,
-        no_status,
-    )
+    from cangauge.service.status_client import NotRunningError, fetch_status, find_socket, no_status
 
     def ask() -> tuple[dict[str, Any], str, Text, dict[str, str]]:
         place = endpoint or find_socket()

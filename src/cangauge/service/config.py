@@ -100,19 +100,14 @@ class MqttConfig(BaseModel, extra="forbid", frozen=True):
     port: int | None = key(None, "Its port.", default_text="1883, with TLS 8883", ge=1, le=65535)
     tls: StrictBool = key(False, "Encrypt, and check its certificate.")
     ca_file: str | None = key(
-        None,
-        "PEM file of the authority that signed it.",
-        default_text="the system's",
-        is_path=True,
+        None, "PEM file of the authority that signed it.", default_text="the system's", is_path=True
     )
     user: str | None = key(None, "User name.")
     password_file: str | None = key(
         None, "File with the password; or in CANGAUGE_MQTT_PASSWORD.", is_path=True
     )
     topic_prefix: str = key(
-        "cangauge",
-        "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.",
-        pattern=_TOPIC,
+        "cangauge", "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.", pattern=_TOPIC
     )
     discovery_prefix: str = key(
         "homeassistant",
@@ -140,9 +135,7 @@ class PublishConfig(BaseModel, extra="forbid", frozen=True):
 
     profile: Literal["pylontech", "victron"] = key(..., "Layout of the frame with the SoC.")
     interface: str | None = key(
-        None,
-        "Driver of the inverter's bus, e.g. socketcan.",
-        default_text="as without `interface`",
+        None, "Driver of the inverter's bus, e.g. socketcan.", default_text="as without `interface`"
     )
     channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.")
     bus_options: dict[str, StrictBool | int | float | str] = key(
@@ -257,9 +250,7 @@ class RunConfig(BaseModel):
         restart=True,
     )
     timeout_s: Positive = key(
-        2.0,
-        "Time without a sample after which the input is stale.",
-        unit="s",
+        2.0, "Time without a sample after which the input is stale.", unit="s"
     )
     ids: FrameIds = key(FrameIds(), "Ids of the published frames.")
     record: str | None = key(
@@ -281,20 +272,11 @@ class RunConfig(BaseModel):
         restart=True,
     )
     record_keep_mb: Positive | None = key(
-        None,
-        "Total size of the recording; the oldest files are removed.",
-        unit="MB",
-        restart=True,
+        None, "Total size of the recording; the oldest files are removed.", unit="MB", restart=True
     )
-    duration_s: Positive | None = key(
-        None,
-        "Stop after this time.",
-        unit="s",
-    )
+    duration_s: Positive | None = key(None, "Stop after this time.", unit="s")
     until_idle_s: Positive | None = key(
-        None,
-        "Stop when no sample came for this time, after the first.",
-        unit="s",
+        None, "Stop when no sample came for this time, after the first.", unit="s"
     )
     state: str | None = key(
         None,
@@ -307,10 +289,7 @@ class RunConfig(BaseModel):
         default_text="systemd's StateDirectory, if there is one",
     )
     state_max_age_s: Positive = key(
-        7.0 * 86400.0,
-        "Age above which the state is refused.",
-        unit="s",
-        restart=True,
+        7.0 * 86400.0, "Age above which the state is refused.", unit="s", restart=True
     )
     state_every_s: FiniteFloat = key(
         # A service that is killed and restarts within three seconds misses less than half a minute

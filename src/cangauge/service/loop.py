@@ -270,9 +270,7 @@ class Loop:
             reasons.add(Reason.DUPLICATE_SENDER)
         self._send(
             self.pipeline.heartbeat(
-                self._now_s - self._last_arrival_s,
-                self.config.timeout_s,
-                Reason(sum(reasons)),
+                self._now_s - self._last_arrival_s, self.config.timeout_s, Reason(sum(reasons))
             )
         )
         # Stay on the clock's grid; skip those missed while the process was suspended.

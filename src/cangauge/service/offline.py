@@ -219,9 +219,7 @@ def estimate_recorded_log(
 
     def report() -> PackReport:
         return PackReport(
-            estimator.health,
-            estimator.power(),
-            None if weakest is None else weakest.report,
+            estimator.health, estimator.power(), None if weakest is None else weakest.report
         )
 
     def observe(sample: Sample) -> None:

@@ -285,10 +285,7 @@ class Pipeline:
         return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
-        self,
-        silent_s: float = 0.0,
-        timeout_s: float = math.inf,
-        reasons: Reason = Reason.NONE,
+        self, silent_s: float = 0.0, timeout_s: float = math.inf, reasons: Reason = Reason.NONE
     ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 

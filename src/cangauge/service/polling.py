@@ -45,10 +45,7 @@ class Poller:
     """
 
     def __init__(
-        self,
-        targets: Iterable[PollTarget],
-        every_s: float,
-        asked_s: dict[int, float] | None = None,
+        self, targets: Iterable[PollTarget], every_s: float, asked_s: dict[int, float] | None = None
     ) -> None:
         self._due_s = dict.fromkeys(targets, -math.inf)
         self._failures = dict.fromkeys(self._due_s, 0)  # in a row

@@ -149,11 +149,7 @@ def _check_publish(config: RunConfig) -> None:
     else:
         return
     raise InputError(
-        problem,
-        source=config.file,
-        field="publish.channel",
-        value=publish.channel,
-        cure=cure,
+        problem, source=config.file, field="publish.channel", value=publish.channel, cure=cure
     )
 
 

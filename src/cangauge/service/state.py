@@ -153,9 +153,7 @@ class StateKeeper:
         self.checkpoint()
         if not self._worker.close(CLOSE_WITHIN_S):
             emit(
-                _LOG.warning,
-                "state.failed",
-                f"{self.path}: the last state was not written in time",
+                _LOG.warning, "state.failed", f"{self.path}: the last state was not written in time"
             )
 
     def checkpoint(self) -> None:

@@ -24,13 +24,7 @@ from cangauge.bus.publish import DETAIL_EVERY, ESTIMATE_EVERY_S, NO_REPORT
 from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.status_client import (
-    BOUNDS_S,
-    SCHEMA,
-    SHOW_EVERY_S,
-    Snapshot,
-    reason_ids,
-)
+from cangauge.service.status_client import BOUNDS_S, SCHEMA, SHOW_EVERY_S, Snapshot, reason_ids
 from cangauge.types import REASON_WORDS, Estimate, Reason, Status, reason_sentences
 
 if TYPE_CHECKING:
