@@ -45,7 +45,7 @@ def wide_command(
             "SoC at the first row, repeated.",
             within=(0.0, 100.0),
             unit="%",
-            words=("auto",),
+            word="auto",
         ),
     ] = None,
     cells: Annotated[int, CELLS] = 4,

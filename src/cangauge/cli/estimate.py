@@ -70,7 +70,7 @@ def estimate_command(
             " (as live), auto.",
             within=(0, 100),
             unit="%",
-            words=("auto",),
+            word="auto",
         ),
     ] = None,
     initial_soc_std: Annotated[

@@ -95,7 +95,7 @@ def fit_command(
             " soc_pct. Default: from a log that runs from full to empty.",
             within=(0.001, 1e5),
             unit="Ah",
-            words=("from-soc",),
+            word="from-soc",
         ),
     ] = None,
     initial_soc: Annotated[
@@ -108,7 +108,7 @@ def fit_command(
             " log pins it.",
             within=(0, 100),
             unit="%",
-            words=("auto",),
+            word="auto",
         ),
     ] = None,
     equation: Annotated[

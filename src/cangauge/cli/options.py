@@ -47,7 +47,7 @@ def option(
     *,
     within: tuple[float, float] | None = None,
     unit: str = "",
-    words: Sequence[str] = (),
+    word: str | None = None,
     suffixes: Sequence[str] = (),
     needs: str | None = None,
 ) -> Any:
@@ -63,7 +63,7 @@ def option(
         Help.
     within : tuple of float, optional
         Least and largest number, both allowed; with their `unit`.
-    words : sequence of str
+    word : str, optional
         May stand in place of a number. The annotation is then `Any`: a float or the word.
     suffixes : sequence of str
         One of which a file to write must have.
@@ -75,14 +75,14 @@ def option(
         field = parameter.opts[-1]
         if isinstance(value, list):
             return [checked(parameter, each) for each in value]
-        if value is None or value in words:
+        if value in {None, word}:
             return value
         if suffixes:
             require_suffix(value, *suffixes, field=field)
             if needs is not None:
                 require_extra(needs, field)
             return value
-        number = value if isinstance(value, int | float) else _number(value, field, words, unit)
+        number = value if isinstance(value, int | float) else _number(value, field, word, unit)
         if within is not None and not within[0] <= number <= within[1]:  # NaN too
             raise InputError(
                 f"must lie within {within[0]:g} … {within[1]:g} {unit}".rstrip(),
@@ -95,16 +95,15 @@ def option(
         bounds = " … ".join(f"{bound:.10g}" for bound in within)
         text = f"{text} (within {f'{bounds} {unit}'.rstrip()})"
     more: dict[str, Any] = {"callback": checked} if within or suffixes else {}
-    if words:
+    if word:
         more["parser"] = str
     return typer.Option(*flags.split(", "), metavar=metavar or None, help=text, **more)
 
 
-def _number(text: str, field: str, words: Sequence[str], unit: str) -> float:
+def _number(text: str, field: str, word: str | None, unit: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        word = " or ".join(words)
         raise InputError(
             f"neither a number nor {word}",
             field=field,

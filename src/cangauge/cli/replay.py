@@ -61,7 +61,7 @@ def replay_command(
             "1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges, without"
             " loss.",
             within=(0.001, 1e6),
-            words=("max",),
+            word="max",
         ),
     ] = 1.0,
     loop: Annotated[
