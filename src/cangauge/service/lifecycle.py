@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from types import FrameType
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
 from cangauge._files import NO_LINK, has_name, is_own, written_name
 from cangauge._text import printable
@@ -149,18 +149,7 @@ class Notifier:
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         address = (environment or {}).get("NOTIFY_SOCKET", "")
         self.active = address.startswith(("/", "@")) and hasattr(socket, "AF_UNIX")
-        if not self.active:
-            return
-        self._address = "\0" + address[1:] if address[0] == "@" else address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-        self._socket.setblocking(False)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.active:
-            self._socket.close()
+        self._address = "\0" + address[1:] if address.startswith("@") else address
 
     def send(self, **values: object) -> None:
         """Send values of sd_notify(3), such as READY=1; STATUS is a line for `systemctl status`.
@@ -169,5 +158,8 @@ class Notifier:
         """
         if self.active:
             lines = (f"{key}={printable(' '.join(str(v).split()))}" for key, v in values.items())
-            with suppress(OSError):  # systemd restarts, or its queue is full
-                self._socket.sendto("\n".join(lines).encode(), self._address)
+            kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC
+            # Not sent while systemd restarts, or its queue is full.
+            with suppress(OSError), socket.socket(socket.AF_UNIX, kind) as notify:
+                notify.setblocking(False)
+                notify.sendto("\n".join(lines).encode(), self._address)

@@ -108,7 +108,7 @@ class RecordedEstimate:
     table: EstimateTable
     scores: Scores
     model: Model
-    settings: EstimatorSettings = field(default_factory=EstimatorSettings)
+    settings: EstimatorSettings
     origin: Origin = "voltage"
     time_source: TimeSourceName | None = None
     counts: dict[str, int] | None = None
@@ -204,10 +204,10 @@ def estimate_recorded_log(
     require_same_pack(log.voltage_v, model, log.source or log.name)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     settings = replace(settings, temperature_source=log.temperature_source, gap_s=gap_of(log))
-    if soc_from_log and log.first_soc() is not None:
+    start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
+    if soc_from_log and start_pct is not None:
         origin = "log"
-        capacity_ah = settings.capacity_ah or model.capacity_ah
-        settings = replace(settings, initial_soc_pct=initial_soc_of(log, capacity_ah))
+        settings = replace(settings, initial_soc_pct=start_pct)
     began = time.perf_counter()
     estimator = make_estimator(model, settings)
     weakest = None
