@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from cangauge._typing import FloatArray
     from cangauge.diagnosis import Diagnosis
     from cangauge.logs.log import Log
-    from cangauge.model.model_file import Model
 
 
 @command()
@@ -133,17 +132,29 @@ def gap_command(
     --reference good2.csv --reference good3.csv`
     """
     from cangauge.diagnosis import diagnose
+    from cangauge.identify.starts import with_start
+    from cangauge.logs.charge import refuse_contradictions
+    from cangauge.model.coulomb_counting import difference_from_reference
+    from cangauge.model.model_file import Model
 
     tests = add_test or []
     healthy = reference or []
-    given = _model_of(model, capacity_ah)
+    given = None if model is None else Model.load(model)
+    if given is not None and capacity_ah is not None:
+        given = given.model_copy(update={"capacity_ah": capacity_ah})
     check_outputs([report, extended], filter(None, [*logs, *tests, *healthy, model]))
     with progress("cangauge.diagnosis") as show:
         read = reading.load_all([*logs, *tests, *healthy], show, [simulated] if simulated else [])
         if given is not None:
             capacity_ah = given.capacity_ah
-            _note_differences(read, capacity_ah)
-        own = _started(read[: len(logs)], initial_soc, capacity_ah)
+            refuse_contradictions(read, capacity_ah)
+            for log in read:
+                if difference := difference_from_reference(log, capacity_ah):
+                    note(f"warning: {difference}")
+        own = read[: len(logs)]
+        if initial_soc is not None:
+            note_starts(own, initial_soc, capacity_ah)
+            own = [with_start(log, initial_soc) for log in own]
         added = read[len(logs) :][: len(tests)]
         references = read[len(logs) + len(tests) :]
         found = diagnose(
@@ -162,30 +173,11 @@ def gap_command(
     written = _write(found, extended, report, model)
     result = found.to_json() | {"assumed": assumed_of(read)}
     if before is not None:
-        result["added_test"] = _added_test(added, before)
+        result["added_test"] = {
+            "logs": [log.name for log in added],
+            "before": {"none": before.posterior.none, **before.posterior.faults},
+        }
     finish(result, partial(_show, found, before, plan, written), as_json=json_output)
-
-
-def _model_of(path: Path | None, capacity_ah: float | None) -> Model | None:
-    """Return the model in a file, with another capacity [Ah] where one is given."""
-    from cangauge.model.model_file import Model
-
-    if path is None:
-        return None
-    model = Model.load(path)
-    if capacity_ah is None:
-        return model
-    return model.model_copy(update={"capacity_ah": capacity_ah})
-
-
-def _started(logs: list[Log], initial_soc: float | None, capacity_ah: float | None) -> list[Log]:
-    """Return the logs with a SoC at their first row [%], if one is given."""
-    from cangauge.identify.starts import with_start
-
-    if initial_soc is None:
-        return logs
-    note_starts(logs, initial_soc, capacity_ah)
-    return [with_start(log, initial_soc) for log in logs]
 
 
 def _write(
@@ -202,24 +194,6 @@ def _write(
         texts[report] = extra("report.diagnosis:gap_page")(found, model).html()
     write_texts_atomic(texts)
     return list(texts)
-
-
-def _added_test(logs: list[Log], before: Diagnosis) -> dict[str, Any]:
-    """Return the names of the logs of a test, and the probabilities without them, for JSON."""
-    return {
-        "logs": [log.name for log in logs],
-        "before": {"none": before.posterior.none, **before.posterior.faults},
-    }
-
-
-def _note_differences(logs: list[Log], capacity_ah: float) -> None:
-    from cangauge.logs.charge import refuse_contradictions
-    from cangauge.model.coulomb_counting import difference_from_reference
-
-    refuse_contradictions(logs, capacity_ah)
-    for log in logs:
-        if difference := difference_from_reference(log, capacity_ah):
-            note(f"warning: {difference}")
 
 
 def _simulation(
