@@ -26,7 +26,7 @@ from cangauge.service.own_frames import OwnFrames
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.polling import SLOWEST_S, Poller
 from cangauge.service.status import Monitor
-from cangauge.types import Estimate, Reason
+from cangauge.types import Reason
 
 _LOG = logging.getLogger(__name__)
 _warn = partial(emit, _LOG.warning)
@@ -135,7 +135,7 @@ class Loop:
             while not (stop() or self._is_over()):
                 self._iterate()
             if self.pipeline.finish():
-                self._give_sample(self.pipeline.latest)
+                self._give("on_sample", self.pipeline.latest_sample, self.pipeline.latest)
             if self.pipeline.published_samples != self.pipeline.samples:
                 self._now_s = time.monotonic()
                 self._publish_periodic()  # a sample that waited counts as silence
@@ -208,7 +208,7 @@ class Loop:
             return False
         if self._outputs or self.pipeline.is_replay:
             estimate = self.pipeline.latest
-            self._give_sample(estimate)
+            self._give("on_sample", self.pipeline.latest_sample, estimate)
             if frames := self.pipeline.replay_frames(estimate):
                 self._send(frames)
                 self._publish_due_s = self._now_s + ESTIMATE_EVERY_S
@@ -240,9 +240,6 @@ class Loop:
                 "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service uses"
                 " receive stamps; to use the log's time, run with --time-source replay-clock",
             )
-
-    def _give_sample(self, estimate: Estimate) -> None:
-        self._give("on_sample", self.pipeline.latest_sample, estimate)
 
     def _give(self, method: str, *news: object) -> None:
         """Give the outputs some news.
