@@ -59,28 +59,28 @@ def export_c_command(
     from cangauge.extras.embedded.embedded import export_c, std_at_rest_pct
     from cangauge.model.model_file import Model
 
-    if model is not None and (cells, capacity_ah) != (None, None):
-        cure = "leave out -m, or --cells and --capacity-ah"
-        raise InputError("the model states these", field="--cells/--capacity-ah", cure=cure)
-    if model is None and (cells is None or capacity_ah is None):
+    if model is not None:
+        if (cells, capacity_ah) != (None, None):
+            cure = "leave out -m, or --cells and --capacity-ah"
+            raise InputError("the model states these", field="--cells/--capacity-ah", cure=cure)
+        chosen = Model.load(model)
+    elif cells is None or capacity_ah is None:
         cure = "give -m MODEL, or --chemistry, --cells and --capacity-ah of a pack without logs"
         raise InputError("no model", field="--model", cure=cure)
-    if model is not None:
-        chosen = Model.load(model)
     else:
-        chosen = Model.prior(chemistry, cells or 1, capacity_ah or 1.0)
-    done = export_c(chosen, output, period_s=period, platform=platform)
+        chosen = Model.prior(chemistry, cells, capacity_ah)
+    files, line_bytes = export_c(chosen, output, period_s=period, platform=platform)
     std_pct = std_at_rest_pct(chosen)
     result = {
-        "folder": str(done.folder),
-        "files": list(done.files),
-        "delay_line_bytes": done.delay_line_bytes,
+        "folder": str(output),
+        "files": files,
+        "delay_line_bytes": line_bytes,
         "std_at_rest_pct": std_pct,
     }
     tests = "" if platform == "arduino" else ": `make test` there runs the tests on this machine"
     text = (
-        f"{len(done.files)} files in {done.folder}{tests}.\n"
-        f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.\n"
+        f"{len(files)} files in {output}{tests}.\n"
+        f"The delay line takes {line_bytes / 1024:.1f} KiB at {period:g} s a sample.\n"
         f"{chosen.name}: from half a minute of rest the SoC is known to ± {std_pct:.1f} % (1σ)."
     )
     finish(result, partial(note, text), as_json=json_output)

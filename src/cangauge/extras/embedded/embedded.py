@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +20,6 @@ from cangauge._version import __version__
 from cangauge.bus.publish import SocPublisher
 from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
@@ -70,19 +68,9 @@ _MARK: Final = _HEAD.format("pack_model.h")
 """Beginning of a header that shows that a folder is of an export."""
 
 
-@dataclass(frozen=True)
-class Exported:
-    """What was written."""
-
-    folder: Path
-    files: tuple[str, ...]
-    delay_line_bytes: int
-    """Memory of the delay line with floats [B]."""
-
-
 def export_c(
     model: Model, folder: Path, *, period_s: float = PERIOD_S, platform: Platform = "generic"
-) -> Exported:
+) -> tuple[list[str], int]:
     """Write the C sources of a model.
 
     Parameters
@@ -95,6 +83,11 @@ def export_c(
         then keeps some of them only.
     platform : {"generic", "esp-idf", "zephyr", "arduino", "foxbms"}
         What the folder is to be: sources with a Makefile, or what a platform builds (`platforms`).
+
+    Returns
+    -------
+    list of str, int
+        Names of the files, and memory of the delay line with floats [B].
 
     Raises
     ------
@@ -132,12 +125,12 @@ def export_c(
         problem = f"this folder cannot be made: {error.strerror}"
         raise InputError(problem, field="--output", value=str(folder)) from error
     write_texts_atomic({folder / name: text for name, text in texts.items()})
-    return Exported(folder, tuple(sorted(texts)), 8 * length)
+    return sorted(texts), 8 * length
 
 
 def std_at_rest_pct(model: Model) -> float:
     """Return the deviation of a SoC near 50 % that the voltage of a rest gives [%]."""
-    estimator, voltage = Estimator(model, EstimatorSettings()), model.voltage_model()
+    estimator, voltage = Estimator(model), model.voltage_model()
     std_pct, second = math.nan, 0
     while second <= model.noise.block_s or math.isnan(std_pct):  # a time skew ends a block later
         estimator.update(Sample(float(second), 0.0, voltage.nominal_v, voltage.loads.t_ref_c))
@@ -198,7 +191,7 @@ def _golden(model: Model, period_s: float) -> str:
 
     A frame holds the numbers rounded to floats, so that both precisions of the core pack the same.
     """
-    reference, publisher = Estimator(model, EstimatorSettings()), SocPublisher()
+    reference, publisher = Estimator(model), SocPublisher()
     rows: list[str] = []
     for sample in drive_with_events(model, period_s):
         found = reference.step(sample)

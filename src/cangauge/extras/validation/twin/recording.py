@@ -146,11 +146,6 @@ def scale_to_gap(
     return replace(fault, size=size), gap_v
 
 
-def is_reached(gap_v: float, target_v: float) -> bool:
-    """Return whether a gap is the wanted one; otherwise the limits of the size prevent it."""
-    return abs(math.log(max(gap_v, 1e-9) / target_v)) < 2.0 * _TOLERANCE
-
-
 def record_drive(
     pack: TwinPack,
     drive: Drive,
