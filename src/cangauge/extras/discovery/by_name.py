@@ -19,7 +19,6 @@ from typing import Final
 
 import can
 import numpy as np
-from can.interfaces.socketcan.constants import CAN_EFF_FLAG
 from cantools.database.can import Database, Message, Signal
 
 from cangauge._typing import FloatArray
@@ -280,15 +279,12 @@ def named_signals(
     InputError
         If no message of the DBC is in the capture.
     """
-    of_dbc = {
-        message.frame_id | (CAN_EFF_FLAG if message.is_extended_frame else 0): message
-        for message in database.messages
-    }
-    frames: defaultdict[int, _NamedFrames] = defaultdict(_NamedFrames)
+    of_dbc = {(each.frame_id, each.is_extended_frame): each for each in database.messages}
+    frames: defaultdict[tuple[int, bool], _NamedFrames] = defaultdict(_NamedFrames)
     is_capture = False
     for each in messages:
         is_capture = True
-        key = each.arbitration_id | (CAN_EFF_FLAG if each.is_extended_id else 0)
+        key = (each.arbitration_id, each.is_extended_id)
         if key in of_dbc and not each.is_error_frame and not each.is_remote_frame:
             frames[key].add(each)
     if is_capture and not frames:

@@ -89,7 +89,9 @@ class Candidate:
     levels : tuple of Level
         Readings by usual scales, its own first; empty where its scale is certain.
     stream, place : Stream, Place, optional
-        Frames and bits of a signal that the physics found.
+        Frames and place of a signal that the physics found.
+    bits : frozenset
+        Its bits there, each with its id: a gateway repeats frames on other buses.
     scale, offset : float
         value = scale × raw + offset, in A, V, % or °C.
     steps, moves : int
@@ -120,6 +122,7 @@ class Candidate:
     levels: tuple[Level, ...] = ()
     stream: Stream | None = None
     place: Place | None = None
+    bits: frozenset[tuple[int, bool, int]] = frozenset()
     scale: float = 1.0
     offset: float = 0.0
     steps: int = 0
@@ -135,13 +138,6 @@ class Candidate:
         if math.isnan(self.low):
             return ""
         return range_text(self.low, self.high, self.unit.replace("degC", "°C"), self.sign)
-
-    @property
-    def bits(self) -> frozenset[tuple[int, bool, int]]:
-        """Its bits, each with its id: a gateway repeats frames on other buses."""
-        if self.stream is None or self.place is None:
-            return frozenset()
-        return self.stream.bits(self.place)
 
     @property
     def is_fit(self) -> bool:
@@ -188,12 +184,8 @@ class Candidate:
     def comments(self) -> list[str]:
         """Return the lines that the map states of it: range, evidence, what decided its scale."""
         lines = [f"{self.name}: {self.range_text or 'in no capture'}; {self.facts}."]
-        factor = f"Factor {self.scale:g} is the"
-        if self.place is not None and self.role == "current":
-            lines.append(f"{factor} usual one that gives a plausible R; others fit as well.")
-            lines.append(f"No current at raw {round(-self.offset / self.scale)}.")
         if others := "; ".join(level.text for level in self.levels[1:]):
-            lines.append(f"{factor} likeliest; the data fit as well: {others}.")
+            lines.append(f"Factor {self.scale:g} is the likeliest; the data fit as well: {others}.")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
@@ -223,8 +215,3 @@ def range_text(low: float, high: float, unit: str, sign: int = 1) -> str:
     """Return a range of values of a sign."""
     ends = sorted((sign * low + 0.0, sign * high + 0.0))
     return f"{ends[0]:.5g} … {ends[1]:.5g} {unit}".replace("-", "−")
-
-
-def is_capacity(capacity_ah: float) -> bool:
-    """Return whether a pack may have this capacity: from a scooter's to a truck's."""
-    return 2.0 < capacity_ah < 600.0

@@ -15,13 +15,7 @@ from cangauge._files import check_writable, make_folder, write_texts_atomic
 from cangauge.cli.options import Json, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import CangaugeError, InputError
-from cangauge.extras.discovery.candidate import (
-    LEAST_HOURS,
-    ROLES,
-    is_capacity,
-    range_text,
-    short_name,
-)
+from cangauge.extras.discovery.candidate import LEAST_HOURS, ROLES, range_text, short_name
 
 if TYPE_CHECKING:
     import can
@@ -334,8 +328,8 @@ def _soc_by_charge(log: Log, sign: int) -> dict[str, Any]:
         return {"agrees": False, "why": why}
     low_ah, high_ah = sorted(sign * half.capacity_ah for half in halves)
     agrees = (
-        is_capacity(low_ah)
-        and is_capacity(high_ah)
+        low_ah > 2.0  # from a scooter's
+        and high_ah < 600.0  # to a truck's
         and low_ah >= LEAST_HOURS * float(abs(log.current_a).max())
         and low_ah * most >= max(half.std_ah for half in halves)
         and high_ah <= (1.0 + most) * low_ah

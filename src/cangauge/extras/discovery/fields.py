@@ -93,24 +93,24 @@ def most_common(values: Ints) -> float:
 # --- Bits in reading order
 
 
-@dataclass
 class _Order:
-    """Bits of a stream in one reading order, most significant first."""
+    """Bits of a stream in one reading order, most significant first.
 
-    is_motorola: bool
-    payload: NDArray[np.uint8]
-    flips: IntArray
-    """How often each bit changes."""
-    set_mostly: BoolArray
-    dead: BoolArray
-    """Bits of alive counters and CRCs."""
-    linked: BoolArray
-    """By cut below each bit: whether the bits on both sides surely belong to one number."""
-    cut: BoolArray
-    """By cut: whether the bits on both sides surely belong to different numbers."""
+    Attributes
+    ----------
+    flips : array
+        How often each bit changes.
+    set_mostly : array of bool
+    dead : array of bool
+        Bits of alive counters and CRCs.
+    linked : array of bool
+        By cut below each bit: whether the bits on both sides surely belong to one number.
+    cut : array of bool
+        By cut: whether the bits on both sides surely belong to different numbers.
+    """
 
-    @classmethod
-    def of(cls, payload: NDArray[np.uint8], dead: BoolArray, *, is_motorola: bool) -> _Order:
+    def __init__(self, payload: NDArray[np.uint8], dead: BoolArray, *, is_motorola: bool) -> None:
+        self.is_motorola, self.dead = is_motorola, dead
         ordered = payload if is_motorola else payload[:, ::-1]
         bits = np.unpackbits(ordered, axis=1)
         # The end of a byte of ones (not available, at wake-up) is no sign of how its bits move.
@@ -118,13 +118,13 @@ class _Order:
         few = (ones[1:] != ones[:-1]).sum(0) <= 2
         steady = ~((ones[1:] | ones[:-1]) & few)
         moved = (bits[1:] != bits[:-1]) & np.repeat(steady, 8, axis=1)
-        flips = moved.sum(0)
+        self.flips = moved.sum(0)
         if not is_motorola:
-            dead = dead[[turned(place, payload.shape[1]) for place in range(len(dead))]]
-        padded = np.pad(ordered, ((0, 0), (0, 2)))
-        linked, cut = _carries(bits, flips)
-        linked |= _together(moved)
-        return cls(is_motorola, padded, flips, bits.mean(0) > 0.5, dead, linked, cut)
+            self.dead = dead[[turned(place, payload.shape[1]) for place in range(len(dead))]]
+        self.payload = np.pad(ordered, ((0, 0), (0, 2)))
+        self.set_mostly = bits.mean(0) > 0.5
+        self.linked, self.cut = _carries(bits, self.flips)
+        self.linked |= _together(moved)
 
     def codes(self, first: int, last: int) -> Ints:
         """Return the unsigned number from `first` to `last` of at most 16 bits, by frame."""
@@ -173,7 +173,7 @@ def fields_of(streams: Sequence[Stream]) -> list[Field]:
     orders = []
     for stream in streams:
         dead = counters_and_crcs(stream.payload)
-        orders.append([_Order.of(stream.payload, dead, is_motorola=each) for each in (True, False)])
+        orders.append([_Order(stream.payload, dead, is_motorola=each) for each in (True, False)])
     odds = _byte_order(orders)
     fields: list[Field] = []
     for number, (stream, pair) in enumerate(zip(streams, orders, strict=True), 1):

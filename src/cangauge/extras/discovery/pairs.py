@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray, IntArray
@@ -43,15 +43,21 @@ shows from seconds on, and slower parts are taken away as a trend."""
 IMPOSSIBLE: Final = -99.0
 
 
-@dataclass(frozen=True, eq=False)
 class _Moves:
     """Rows on a grid, freed of their slow part, in units of their standard deviation.
 
     Parameters
     ----------
     rows : sequence of Row
-    level, values : array (m, n)
-        Raw numbers on the grid, as they are and freed of their slow part.
+    level : array (m, n)
+        Raw numbers on the grid.
+    step_s : float
+        Step of the grid [s].
+
+    Attributes
+    ----------
+    values : array (m, n)
+        Raw numbers freed of their slow part.
     std : array (m,)
     independent : array (m,)
         Number of independent moves.
@@ -59,43 +65,29 @@ class _Moves:
         Autocorrelation over one move.
     """
 
-    rows: Sequence[Row]
-    level: FloatArray
-    values: FloatArray
-    std: FloatArray
-    independent: FloatArray
-    memory: FloatArray
-
-    @classmethod
-    def of(cls, rows: Sequence[Row], grid: Grid) -> _Moves:
-        """Return rows on a grid."""
-        return cls.of_level(rows, np.array([row.means_on(grid) for row in rows]), grid.step_s)
-
-    @classmethod
-    def of_level(cls, rows: Sequence[Row], level: FloatArray, step_s: float) -> _Moves:
-        """Return the moves of raw numbers on a grid of `step_s`."""
+    def __init__(self, rows: Sequence[Row], level: FloatArray, step_s: float) -> None:
+        self.rows, self.level = rows, level
         # The trend over 10 s: SoC and temperature move more slowly.
         width = max(3, min(int(10.0 / step_s), level.shape[1] // 2))
-        padded = np.pad(level, ((0, 0), (width // 2 + 1, width - width // 2 - 1)), mode="edge")
-        sums = np.cumsum(padded, axis=1)
-        free = level - (sums[:, width:] - sums[:, :-width]) / width
+        free = level - uniform_filter1d(level, width, axis=1, mode="nearest")
         bound = 5.0 * np.sqrt((free**2).mean(1, keepdims=True))
         free = np.clip(free, -bound, bound)
         free -= free.mean(1, keepdims=True)
-        std = free.std(1)
+        self.std = free.std(1)
         group = max(1, round(MOVE_S / step_s))
         # One lone step moves the mean of many slots, and is still one.
         moves = np.sqrt(
             _participation(np.diff(_grouped(level, group), axis=1))
             * _participation(_grouped(free, group))
         )
-        values = (free / np.maximum(std, 1e-12)[:, None]).astype(np.float32)
-        memory = (values[:, group:] * values[:, :-group]).mean(1, dtype=np.float64)
+        values = (free / np.maximum(self.std, 1e-12)[:, None]).astype(np.float32)
+        self.values = values
+        self.memory = (values[:, group:] * values[:, :-group]).mean(1, dtype=np.float64)
         # A measured quantity dithers: several changes make one independent move. From 60 on a
         # chance is excluded: two minutes of driving have as many, and the noise of a sensor that
         # is sent twice has more.
         most = np.minimum(60.0, [row.steps / 4.0 for row in rows])
-        return cls(rows, level, values, std, np.minimum(moves, most), memory)
+        self.independent = np.minimum(moves, most)
 
 
 def _grouped(rows: FloatArray, group: int) -> FloatArray:
@@ -108,7 +100,6 @@ def _participation(rows: FloatArray) -> FloatArray:
     return np.asarray((rows**2).sum(1) ** 2 / np.maximum((rows**4).sum(1), 1e-12))
 
 
-@dataclass(frozen=True, eq=False)
 class _Pairs:
     """All pairs of a voltage (rows) and a current (columns).
 
@@ -116,6 +107,11 @@ class _Pairs:
     ----------
     u, i : _Moves
         Of the m voltages and of the n currents.
+    step_s : float
+        Step of their grid [s].
+
+    Attributes
+    ----------
     r, slope : array (m, n)
         Correlation of their moves, and |dU/dI| in raw numbers.
     evidence, score : array (m, n)
@@ -124,25 +120,16 @@ class _Pairs:
         Likeliest scale of the current [A].
     """
 
-    u: _Moves
-    i: _Moves
-    r: FloatArray
-    slope: FloatArray
-    evidence: FloatArray
-    score: FloatArray
-    amps: FloatArray
-
-    @classmethod
-    def of(cls, u: _Moves, i: _Moves, step_s: float) -> _Pairs:
-        """Return the pairs with their posterior."""
-        r = _product(u.values, i.values)
-        slope = np.abs(r) * u.std[:, None] / np.maximum(i.std, 1e-9)
+    def __init__(self, u: _Moves, i: _Moves, step_s: float) -> None:
+        self.u, self.i = u, i
+        self.r = r = _product(u.values, i.values)
+        self.slope = slope = np.abs(r) * u.std[:, None] / np.maximum(i.std, 1e-9)
         evidence = _evidence(u, i, r, slope, step_s)
         is_impossible = _is_copy(u, i, r, slope) | _sags_too_far(u, i, slope, evidence)
-        likely, amps = _scales(u, i, slope, evidence >= 1.0)
-        evidence = np.where(likely > IMPOSSIBLE / 2.0, evidence, 0.0)
-        score = (
-            evidence
+        likely, self.amps = _scales(u, i, slope, evidence >= 1.0)
+        self.evidence = np.where(likely > IMPOSSIBLE / 2.0, evidence, 0.0)
+        self.score = (
+            self.evidence
             + _polarisation(u, i, r, step_s)
             + np.array([row.prior for row in u.rows])[:, None]
             + np.array([row.prior for row in i.rows])
@@ -151,8 +138,7 @@ class _Pairs:
             + 4.0 * (_streams(u)[:, None] == _streams(i))
             - 1.5 * _has_sibling(u)[:, None]
         )
-        score[is_impossible] = IMPOSSIBLE
-        return cls(u, i, r, slope, evidence, score, amps)
+        self.score[is_impossible] = IMPOSSIBLE
 
     def ranked(self) -> Iterator[tuple[int, int]]:
         """Yield voltage and current of the possible pairs, best first; each bit keeps its role."""
@@ -206,8 +192,11 @@ def best_pairs(
     voltages: Sequence[Row], currents: Sequence[Row], grid: Grid
 ) -> tuple[list[Candidate], list[Candidate], Row | None]:
     """Return the best candidates for current and voltage, and the row of the first current."""
-    u, i = (_Moves.of(rows, grid) for rows in (voltages, currents))
-    pairs = _Pairs.of(u, i, grid.step_s)
+    u, i = (
+        _Moves(rows, np.array([row.means_on(grid) for row in rows]), grid.step_s)
+        for rows in (voltages, currents)
+    )
+    pairs = _Pairs(u, i, grid.step_s)
     found: tuple[list[Candidate], list[Candidate]] = ([], [])
     chosen: Row | None = None
     for a, b in pairs.ranked():
@@ -295,7 +284,7 @@ def _polarisation(u: _Moves, i: _Moves, r: FloatArray, step_s: float) -> FloatAr
     """
     keep = math.exp(-step_s / POLARISATION_S)
     past = lfilter([1.0 - keep], [1.0, -keep], i.level - i.level[:, :1], axis=1)
-    low = _Moves.of_level(i.rows, np.asarray(past), step_s)
+    low = _Moves(i.rows, np.asarray(past), step_s)
     with_past = _product(u.values, low.values)
     own = (i.values * low.values).mean(1, dtype=np.float64)
     spread = low.std / np.maximum(i.std, 1e-9)

@@ -137,6 +137,7 @@ class Row:
             period_s=stream.period_s,
             stream=stream,
             place=place,
+            bits=self.bits,
             scale=scale,
             offset=offset,
             steps=self.steps,
