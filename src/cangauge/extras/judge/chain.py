@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from scipy.ndimage import find_objects
 
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
@@ -147,16 +148,19 @@ class Chain:
         parted = np.diff([samples.stretch, np.floor(samples.hours / block_h), piece], prepend=-1.0)
         first = np.flatnonzero(parted.any(axis=0))
         every = _means(samples, first)
-        used, is_full = _used(every, len(parts), model)
+        used, is_full = _used(every, model)
         of_used: list[Any] = [each[used] for each in every]
         self.blocks = blocks = Samples(*of_used)
         # The delay line fills.
         blocks.voltage_v[blocks.hours < 3.0 * block_h] = np.nan
         self.is_full = is_full[used]
         self.piece = np.where(np.isfinite(blocks.count_pct), piece[first[used]], -1)
+        places = [find_objects(each.stretch + 1) for each in (samples, blocks)]
         self.stretches = [
-            Stretch(log, rows, _places(samples.stretch, k), _places(blocks.stretch, k), continues)
-            for k, (log, rows, continues) in enumerate(cuts)
+            Stretch(log, rows, of_samples, of_blocks, continues)
+            for (log, rows, continues), (of_samples,), (of_blocks,) in zip(
+                cuts, *places, strict=True
+            )
         ]
         self.fitting_pct = self._fitting()
         growth = np.maximum(1.0, resistance_factor(blocks.temperature_c))
@@ -235,12 +239,6 @@ class Chain:
         return np.interp(self.samples.clock_h, self.blocks.clock_h, values)
 
 
-def _places(stretch: IntArray, k: int) -> slice:
-    """Return where a stretch is among the samples or blocks of all."""
-    low, high = np.searchsorted(stretch, [k, k + 1]).tolist()
-    return slice(low, high)
-
-
 def _uninterrupted(log: Log) -> Iterator[tuple[slice, bool]]:
     """Yield the rows of a log between its pauses, and whether they continue those before."""
     step_s = np.diff(log.time_s)
@@ -299,7 +297,7 @@ def _means(samples: Samples, first: IntArray) -> Samples:
     return Samples(samples.stretch[first], *means)
 
 
-def _used(blocks: Samples, stretches: int, model: Model) -> tuple[IntArray, BoolArray]:
+def _used(blocks: Samples, model: Model) -> tuple[IntArray, BoolArray]:
     """Return the blocks that are used, and whether a charge has ended full at each of all.
 
     It has where a high voltage was held for five minutes, until the current was below C/20, of
@@ -312,8 +310,7 @@ def _used(blocks: Samples, stretches: int, model: Model) -> tuple[IntArray, Bool
         typical = CHEMISTRIES[model.chemistry].curve_v
         knee_v = max(knee_v, model.cells * float(np.interp(99.5, KNOTS_PCT, typical)))
     used, is_full = [], np.zeros(blocks.hours.size, dtype=bool)
-    for k in range(stretches):
-        inside = _places(blocks.stretch, k)
+    for (inside,) in find_objects(blocks.stretch + 1):
         voltage_v, ends = blocks.voltage_v[inside], list[int]()
         held = voltage_v >= max(0.998 * float(voltage_v.max()), knee_v)
         edges = inside.start + np.flatnonzero(np.diff(held, prepend=False, append=False))

@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import median
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.logs.log import Log
@@ -108,11 +109,7 @@ def _jumps(time_s: FloatArray, count: FloatArray, shown: FloatArray, least: floa
     first = np.flatnonzero(np.diff(window, prepend=-1.0))
     if first.size < 3:
         return []
-    low, high = (np.diff(first, append=known.size) - 1) // 2, np.diff(first, append=known.size) // 2
-    level, value = (
-        0.5 * (inside[first + low] + inside[first + high])
-        for inside in (of[known][np.lexsort([of[known], window])] for of in (count, shown))
-    )
+    level, value = (median(of[known], window, window[first]) for of in (count, shown))
     # Over two windows, so that a jump of a minute counts whole.
     change = level[2:] - level[:-2]
     usual = float(np.quantile(np.abs(np.diff(level)), 0.9))

@@ -8,6 +8,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
+from scipy import ndimage
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
@@ -141,9 +142,9 @@ def _check_count(chain: Chain) -> None:
     the voltage is not.
     """
     samples, known = chain.samples, np.isfinite(chain.samples.shown_pct)
-    _, of, rows = np.unique(samples.stretch[known], return_inverse=True, return_counts=True)
+    of = samples.stretch[known]
     soc, charge = (
-        each[known] - (np.bincount(of, each[known]) / rows)[of]
+        each[known] - ndimage.mean(each[known], of, of)
         for each in (samples.shown_pct, samples.drawn_pct)
     )
     if (soc @ charge) ** 2 <= 0.8 * (soc @ soc) * (charge @ charge):

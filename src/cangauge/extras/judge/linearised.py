@@ -94,10 +94,6 @@ class Terms:
         """Return the numbers of the columns of a set of faults."""
         return np.array([*range(self.healthy), *(self.healthy + k for k in sorted(chosen))])
 
-    def soc_pct(self, theta: FloatArray) -> FloatArray:
-        """Return the SoC of each block [%]."""
-        return np.asarray(self.chain.fitting_pct + self.S @ theta)
-
 
 class Linearised:
     """The model of a chain, linearised at given coefficients.
@@ -120,7 +116,7 @@ class Linearised:
         of = np.arange(theta.size) if chosen is None else terms.of(chosen)
         columns = [terms.columns[k] for k in of]
         self.faults, self._std = columns[self._n :], np.array([each.std for each in columns])
-        soc_pct, theta = terms.soc_pct(theta), theta[of]
+        soc_pct, theta = terms.chain.fitting_pct + terms.S @ theta, theta[of]
         self._S, volts = terms.S[:, of], terms.volts[:, of]
         distances, moves = list[FloatArray | float](), csr_array(self._S.shape)
         for each, coefficient in zip(columns, theta.tolist(), strict=True):

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from cangauge._text import counted, number
-from cangauge.extras.judge.faults import FAULTS
 from cangauge.extras.judge.result import Judgement
 from cangauge.extras.judge.text import moment, signed
 from cangauge.extras.report.charts import ORANGE, Figure, TimeFigures
@@ -26,7 +25,6 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
     logs = judgement.logs
     first, *rest = judgement.text.split("\n")
     std = number(judgement.error_std_pct, 1, "%")
-    faults = [_fault_table(judgement)] if judgement.faults else []
     return Page(
         title=f"Second opinion on the gauge of {joined([log.name for log in logs])}",
         lead=first,
@@ -39,7 +37,7 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
             "Why, and what next": [[text] for text in rest],
             "Both states of charge": [_figure(judgement)],
         },
-        folded={"Faults": faults, "Pieces": [_piece_table(judgement)]},
+        folded={"Pieces": [_piece_table(judgement)]},
         model=judgement.model,
         model_path=model_path,
         logs=logs,
@@ -58,20 +56,6 @@ def _piece_table(judgement: Judgement) -> Table:
         for piece in judgement.pieces
     ]
     return Table(["from", "until", "error at its end [% SoC]", "σ", "stands still"], rows)
-
-
-def _fault_table(judgement: Judgement) -> Table:
-    rows = [
-        [
-            fault.name.replace("_", " "),
-            number(100.0 * fault.probability, 0),
-            f"{signed(fault.size, 2)} {FAULTS[fault.name].unit}",
-            f"{signed(fault.interval[0], 2)} … {signed(fault.interval[1], 2)}",
-            "before the first log" if fault.since is None else moment(judgement, fault.since),
-        ]
-        for fault in judgement.faults
-    ]
-    return Table(["fault", "probability [%]", "size", "95 %", "since"], rows)
 
 
 def _figure(judgement: Judgement) -> Figure:

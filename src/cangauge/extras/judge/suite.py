@@ -24,8 +24,8 @@ import numpy as np
 from cangauge._resources import shared_file
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.database import find_signal, load_dbc, signal_codec
-from cangauge.bus.open import bus_address, has_socketcan, open_bus
+from cangauge.bus.database import load_dbc, signal_codec
+from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.time_source import MICROSECONDS, clock_frame
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
@@ -166,8 +166,7 @@ def run_suite(
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:  # for suites side by side
         free.bind(("", 0))
         port = int(free.getsockname()[1])
-    found = bus_address("socketcan" if has_socketcan("vcan0") else "udp_multicast")
-    address = replace(found, options={**found.options, "port": port})
+    address = bus_address(options={"port": port})
     scores = []
     with (
         tempfile.TemporaryDirectory(prefix="cangauge-suite-") as folder,
@@ -187,10 +186,12 @@ class _Gauge:
     def __init__(self, bus: BusConnection, folder: Path, command: Sequence[str]) -> None:
         self._bus, self._folder, self._command = bus, folder, command
         database = load_dbc(shared_file("dbc", "soc_estimate.dbc"))
-        message, soc = find_signal(database, "SOC_ESTIMATE", "soc_pct")
-        _, std = find_signal(database, "SOC_ESTIMATE", "soc_std_pct")
+        message = database.get_message_by_name("SOC_ESTIMATE")
         self._id = message.frame_id
-        self._codecs = [signal_codec(message, signal) for signal in (soc, std)]
+        self._codecs = [
+            signal_codec(message, message.get_signal_by_name(name))
+            for name in ("soc_pct", "soc_std_pct")
+        ]
         self._was_ready = False
         self._answers_a_sample = 1.0
 

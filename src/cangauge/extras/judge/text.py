@@ -149,7 +149,7 @@ def _wrong(piece: Piece) -> str:
     return f"{number(abs(piece.error_pct), 1)} ± {number(piece.std_pct, 1)} % SoC {side}"
 
 
-def signed(value: float, digits: int = 1) -> str:
-    """Return a number with its sign."""
-    text = number(value, digits)
+def signed(value: float) -> str:
+    """Return a number with its sign, to a tenth."""
+    text = number(value, 1)
     return text if value < 0.0 else f"+{text}"
