@@ -47,10 +47,9 @@ class Grid:
     def longest(self, pause_s: float) -> slice:
         """Return the slots of the longest part without a pause: there the SoC may jump."""
         filled = np.unique(np.concatenate(list(self._slots.values())))
-        ends = np.flatnonzero(np.diff(filled) * self.step_s > pause_s)
-        firsts, lasts = np.append(0, ends + 1), np.append(ends, len(filled) - 1)
-        longest = int((filled[lasts] - filled[firsts]).argmax())
-        return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
+        parts = np.split(filled, np.flatnonzero(np.diff(filled) * self.step_s > pause_s) + 1)
+        longest = max(parts, key=np.ptp)
+        return slice(int(longest[0]), int(longest[-1]) + 1)
 
 
 @dataclass(eq=False)
