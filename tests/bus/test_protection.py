@@ -220,7 +220,7 @@ def test_a_map_file_chooses_the_rule_of_each_message(tmp_path: Path) -> None:
     slow = '[messages.Slow]\nprotection = "e2e_05"\ndata_id = 0x1234\nperiod_s = 0.5\n'
     messages = load(tmp_path, fast + slow).messages
     assert messages[0x100].rule == TRIED["01 nibble"]
-    assert messages[0x101] == (TRIED["05"], 0.5, b"", False, None)
+    assert messages[0x101] == (TRIED["05"], 0.5, b"", False, None, "e2e_05")
     counter = '[messages.Fast]\nprotection = "counter"\ncounter = "Alive"\ncounter_modulus = 15\n'
     rule = load(tmp_path, counter).messages[0x100].rule
     assert rule is not None

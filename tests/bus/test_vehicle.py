@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import RULES, ProtectionRule
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
@@ -178,7 +177,7 @@ def test_the_map_file_adds_codes_conditions_and_rules(own: Path) -> None:
     voltage = load(own, MAP.replace("[temperature]", more)).voltage
     assert 9999 in voltage.codec.not_available
     assert [voltage.codec.is_in(bytes([*bytes(6), n, 0])) for n in (3, 2)] == [True, False]
-    assert voltage.checks == SignalChecks(lowest=2.0)
+    assert (voltage.checks.lowest, voltage.checks.highest) == (2.0, math.inf)
     message = load(own, MAP + (
         '\n[messages.0x100]\nprotection = "mine"\nperiod_s = 0.5\n'
         "[rules.mine]\npolynomial = 0x2F\ninitial = 0xFF\ncounter_bits = 4\n"

@@ -16,7 +16,7 @@ from live import frames_of, short_log
 
 @pytest.mark.parametrize(
     ("rule", "name"),
-    [(ProtectionRule(polynomial=0x2F, counter_modulus=15, counter_byte=-2), "own rule"),
+    [(ProtectionRule(polynomial=0x2F, counter_modulus=15, counter_byte=-2), "mine"),
      (E2eRule("e2e_05", data_id=0x1234), "e2e_05")],
 )  # fmt: skip
 def test_a_broken_frame_counts_by_the_stated_rule(
@@ -24,7 +24,7 @@ def test_a_broken_frame_counts_by_the_stated_rule(
 ) -> None:
     vehicle = Vehicle.load("generic")
     messages = dict(vehicle.messages)
-    messages[0x400] = messages[0x400]._replace(rule=rule)
+    messages[0x400] = messages[0x400]._replace(rule=rule, name=name)
     frames = [each for each in frames_of(short_log(10.0)) if each.arbitration_id in {0x400, 0x401}]
     count = 0
     with can.CanutilsLogWriter(tmp_path / "x.log") as writer:

@@ -15,13 +15,12 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 import cantools.database
 import numpy as np
 from can.typechecking import StringPathLike
 from cantools.database.can import Database, Message, Signal
-from numpy.typing import NDArray
 
 from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
@@ -171,9 +170,10 @@ class SignalCodec:
         """
         for field, values in self.conditions:
             field.put(payload, min(values))
-        self.field.put(payload, self._raw(value))
+        self.field.put(payload, self.raw_number(value))
 
-    def _raw(self, value: float) -> int:
+    def raw_number(self, value: float) -> int:
+        """Return the raw number of a value; raise InputError as `encode_into`."""
         number = ((value - self.shift) / self.gain - self.offset) / self.factor
         if math.isnan(value) and not self.float_format:
             if not self.not_available:
@@ -212,12 +212,6 @@ class SignalCodec:
             high -= 1
         ends = sorted(self.gain * (n * self.factor + self.offset) + self.shift for n in (low, high))
         return ends[0], ends[1]
-
-    def fits(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Return which values `encode_into` can send; NaN counts as one."""
-        raw, (low, high) = self.raw_numbers(values), self.raw_range
-        is_sent = ~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available)))
-        return is_sent | bool(self.float_format)
 
     def raw_numbers(self, values: FloatArray) -> FloatArray:
         """Return the raw numbers of values, NaN for NaN."""
@@ -283,11 +277,7 @@ def signal_codec(
     selectors = _selectors(message, signal)
     conditions = [(_bits_of(message, selector), values) for selector, values in selectors]
     for name, value in (when or {}).items():
-        other = _signal(message, name)
-        if other is None:
-            problem = f"message {message.name} has no such signal"
-            raise InputError(problem, field="when", value=name)
-        other_bits = _bits_of(message, other)
+        other_bits = _bits_of(message, named_signal(message, name, "when"))
         conditions.append((other_bits, frozenset({value & other_bits.mask})))
     return SignalCodec(
         name=signal.name,
@@ -357,6 +347,14 @@ def _signal(message: Message, name: str) -> Signal | None:
     return next((each for each in message.signals if each.name == name), None)
 
 
+def named_signal(message: Message, name: str, field: str) -> Signal:
+    """Return the signal of that name; raise InputError with `field` if there is none."""
+    signal = _signal(message, name)
+    if signal is None:
+        raise InputError(f"message {message.name} has no such signal", field=field, value=name)
+    return signal
+
+
 def load_dbc(path: StringPathLike, remarks: list[str] | None = None) -> Database:
     """Read a DBC file.
 
@@ -372,32 +370,21 @@ def load_dbc(path: StringPathLike, remarks: list[str] | None = None) -> Database
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")  # the encoding that most tools write
+    text, changes = prepared(text, path)
     try:
-        text, changes = prepared(text, path)
         if re.search(r"\bBO_\s+\d", text) is None:  # another text takes as long to parse as a DBC
             raise ValueError("it has no message (BO_)")  # noqa: TRY301 - reported as others are
         database = cantools.database.load_string(text, "dbc", strict=False)
-    except (
-        cantools.Error,
-        LookupError,
-        ValueError,
-        TypeError,
-        ArithmeticError,
-        AttributeError,
-        AssertionError,  # a multiplexed signal without a multiplexer
-        RecursionError,  # signals multiplexed in a circle
-    ) as error:
+    except Exception as error:  # a damaged DBC may raise anything in cantools
         words = " ".join((str(error) or type(error).__name__).split())[:160]
         problem = f"not a DBC file that can be read: {words}"
         cure = "open it in a DBC editor, which names the error"
         if path.suffix.lower() in _CONVERTED:
             cure = f"convert it: python -m cantools convert {path} car.dbc"
         raise InputError(problem, source=path, cure=cure) from error
-    if not isinstance(database, Database) or not database.messages:
-        raise InputError("the DBC defines no messages", source=path)
     if remarks is not None:
         remarks += changes
-    return database
+    return cast("Database", database)
 
 
 def find_message(database: Database, message: str | int) -> Message:
@@ -412,7 +399,7 @@ def find_message(database: Database, message: str | int) -> Message:
     found = [each for each in messages if each.name == message or each.frame_id == number]
     if len(found) == 1:
         return found[0]
-    near = "" if number is not None else closest(str(message), (each.name for each in messages))
+    near = closest(str(message), (each.name for each in messages))
     if found:
         problem, cure = f"the DBC defines {len(found)} such messages", "keep one of them"
     else:

@@ -13,7 +13,7 @@ from cantools.database.can import Message
 from pydantic import AliasChoices, Field, PositiveFloat, model_validator
 
 from cangauge._config import read_toml
-from cangauge.bus.database import BitField
+from cangauge.bus.database import BitField, named_signal
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import (
     PROFILES,
@@ -103,14 +103,12 @@ class CellsMap(Fields):
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
-        if (self.signal is None) is (self.index is None):
-            raise ValueError("give either signal, or index and signals")
+        is_group, of_group = self.signal is None, (self.index, self.signals or None)
+        is_whole = of_group.count(None) == (0 if is_group else 2)
+        if not is_whole or (is_group and self.message is None):
+            raise ValueError("give either signal, or index, signals and message")
         if self.signal is not None and "{n" not in self.signal:
             raise ValueError('signal needs "{n}" for the number of the cell')
-        if self.index is not None and (not self.signals or self.message is None):
-            raise ValueError("index needs signals and message")
-        if self.signal is not None and self.signals:
-            raise ValueError("signals belongs to index")
         for name in (self.signal, self.message):
             try:
                 _numbered(name, 1)
@@ -194,11 +192,7 @@ class MessageMap(Fields):
         if self.counter is None:
             cure = "name the signal of the alive counter"
             raise InputError("is missing", field="counter", cure=cure)
-        signal = next((each for each in message.signals if each.name == self.counter), None)
-        if signal is None:
-            problem = f"message {message.name} has no such signal"
-            raise InputError(problem, field="counter", value=self.counter)
-        bits = BitField.of(signal, message.length)
+        bits = BitField.of(named_signal(message, self.counter, "counter"), message.length)
         return CounterRule(bits, self.counter_modulus or 1 << bits.width)
 
 
@@ -238,10 +232,8 @@ class VehicleMap(Fields):
 
     @model_validator(mode="before")
     @classmethod
-    def _short_forms(cls, data: object) -> object:
+    def _short_forms(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Accept `dbc = "a.dbc"`, and `soc = "DisplaySoc"` for a table with the signal alone."""
-        if not isinstance(data, dict):
-            return data
         if isinstance(data.get("dbc"), str):
             data = {**data, "dbc": (data["dbc"],)}
         roles = ("current", "voltage", "temperature", "soc", "soc_reference")
@@ -255,9 +247,4 @@ def columns_of_map(path: Path | str) -> ColumnMap | None:
     Raises InputError if the file cannot be read, or a column is not understood.
     """
     columns = read_toml(path).get("columns")
-    if columns is None:
-        return None
-    where = f"{path}: columns"
-    if not isinstance(columns, dict):
-        raise InputError("must be a table", field=where, cure='write [columns], then time = "…"')
-    return ColumnMap.of(columns, where)
+    return None if columns is None else ColumnMap.of(columns, f"{path}: columns")

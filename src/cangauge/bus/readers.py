@@ -141,25 +141,29 @@ class CaptureReader(MessageReader, ABC):
         left out. Raises InputError if most lines are malformed; it names the first.
         """
         buses, clock = set[Any](), _Clock()
+        for message in self._frames():
+            is_known = message.channel in buses or len(buses) < MOST_BUSES
+            if is_known and abs(message.timestamp) <= LATEST_S:  # false for NaN
+                buses.add(message.channel)
+                if not self._is_bus_time:
+                    message.timestamp = clock.running_s(message.channel, message.timestamp)
+                self.frames += 1
+                yield message
+            else:
+                self.skip(None)
+        self.remarks += clock.remarks()
+
+    def _undamaged(self) -> Iterator[can.Message]:
+        """Yield the frames as far as the file can be read."""
         try:
-            for message in self._frames():
-                is_known = message.channel in buses or len(buses) < MOST_BUSES
-                if is_known and abs(message.timestamp) <= LATEST_S:  # false for NaN
-                    buses.add(message.channel)
-                    if not self._is_bus_time:
-                        message.timestamp = clock.running_s(message.channel, message.timestamp)
-                    self.frames += 1
-                    yield message
-                else:
-                    self.skip(None)
+            yield from self.read()
         except DAMAGE as error:
             self.cut_off = True
             self.damage = f"{type(error).__name__}: {error}"
-        self.remarks += clock.remarks()
 
     def _frames(self) -> Iterator[can.Message]:
         """Return the frames that are read, without stale ones where the clock is the logger's."""
-        frames = self.read()
+        frames = self._undamaged()
         if self.keeps_dates and (first := next(frames, None)) is not None:
             self._is_bus_time = first.timestamp >= FIRST_DATE_S
             frames = chain([first], frames)
@@ -167,13 +171,7 @@ class CaptureReader(MessageReader, ABC):
 
     def _current(self, frames: Iterator[can.Message]) -> Iterator[can.Message]:
         """Yield frames without those at the head that a logger's buffer has kept from before."""
-        head: list[can.Message] = []
-        damage: Exception | None = None
-        try:
-            head.extend(islice(frames, STALE_FRAMES))
-        except DAMAGE as error:
-            damage = error
-        stale = 0
+        head, stale = list(islice(frames, STALE_FRAMES)), 0
         for place, (one, two) in enumerate(pairwise(head[: len(head) // 2]), start=1):
             step_s = two.timestamp - one.timestamp
             is_jump = step_s < -OUT_OF_ORDER_S or step_s > max(PERIODS_S)
@@ -185,8 +183,6 @@ class CaptureReader(MessageReader, ABC):
             others = "1 frame" if stale == 1 else f"{stale} frames"
             self.remarks.append(f"{others} at the head left out, with stamps of another time")
         yield from head[stale:]
-        if damage is not None:
-            raise damage
         yield from frames
 
     def __iter__(self) -> Iterator[can.Message]:

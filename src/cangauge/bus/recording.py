@@ -230,19 +230,22 @@ class CaptureSamples:
         rows = np.isfinite(self.voltage_v) & (np.diff(self.time_s, prepend=-np.inf) > 0.0)
         if rows.sum() < 2:
             return None
-        time_s, current_a, voltage_v, soc_pct = (
-            column[rows] for column in (self.time_s, self.current_a, self.voltage_v, self.soc_pct)
-        )
-        cold_c = np.zeros(time_s.size)
         return Log(
-            time_s, current_a, voltage_v, cold_c, soc_pct, name=self.name, source=self.source
+            self.time_s[rows],
+            self.current_a[rows],
+            self.voltage_v[rows],
+            np.zeros(rows.sum()),
+            self.soc_pct[rows],
+            name=self.name,
+            source=self.source,
         )
 
 
-def open_vehicle_capture(path: StringPathLike, vehicle: Vehicle) -> Capture:
-    """Open a capture; without stamps, the vehicle's current message counts time."""
-    period_s = vehicle.messages[vehicle.current.key].period_s
-    clock = CLOCK if period_s is None else (vehicle.current.arbitration_id, period_s)
+def open_vehicle_capture(path: StringPathLike, vehicle: Vehicle | None) -> Capture:
+    """Open a capture; without stamps, the current message of a vehicle counts time."""
+    clock = CLOCK
+    if vehicle is not None and (period_s := vehicle.messages[vehicle.current.key].period_s):
+        clock = vehicle.current.arbitration_id, period_s
     return open_capture(path, clock=clock)
 
 
@@ -273,8 +276,6 @@ def capture_samples(path: StringPathLike, vehicle: Vehicle) -> CaptureSamples:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if isinstance(bus.time, ReplayClock):
         remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
-    if bus.time.beginnings:
-        remarks.append(f"the replay clock starts again {bus.time.beginnings} times")
     if bus.sessions:
         remarks.append(f"the stamps start again: {len(bus.sessions) + 1} sessions in one file")
     return CaptureSamples(

@@ -64,7 +64,7 @@ class VehicleSignal:
     message: str
     length: int
     codec: SignalCodec
-    checks: SignalChecks = dataclasses.field(default_factory=SignalChecks)
+    checks: SignalChecks
 
     @property
     def arbitration_id(self) -> int:
@@ -80,6 +80,7 @@ class VehicleSignal:
 class MessageProtection(NamedTuple):
     """Protection and period [s] of one message, where known, and how it is identified.
 
+    `name`: of the protection in the map file.
     `reply`: first bytes of a reply over ISO-TP; b"" for other messages. `request_id`: on which it
     may be asked for; `by_pgn`: from any source address (J1939).
     """
@@ -89,6 +90,7 @@ class MessageProtection(NamedTuple):
     reply: bytes = b""
     by_pgn: bool = False
     request_id: int | None = None
+    name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,10 +333,7 @@ class _Binder:
         # A stated offset is in the canonical unit and keeps its sign.
         gain, shift = wanted.sign * wanted.scale * factor, wanted.offset + wanted.sign * offset
         codec = dataclasses.replace(codec, gain=gain, shift=shift)
-        stated = wanted.model_dump(exclude_unset=True)
-        stated = {name: stated[name] for name in SignalChecks.model_fields.keys() & stated}
-        checks = validated(SignalChecks, stated, f"{self._source}: {role}")
-        return VehicleSignal(role, key, message.name, message.length, codec, checks)
+        return VehicleSignal(role, key, message.name, message.length, codec, wanted)
 
     def _unit(self, role: Role, codec: SignalCodec) -> tuple[float, float]:
         """Return factor and offset from the DBC's unit to the canonical one."""
@@ -364,7 +363,9 @@ class _Binder:
             with located(self._source, f"messages.{message.name}"):
                 rule = each.rule(message, self._mapping.rules)
                 reply = self._reply_of(message, each)
-            protections[key] = MessageProtection(rule, period_s, reply, each.j1939, each.request_id)
+            protections[key] = MessageProtection(
+                rule, period_s, reply, each.j1939, each.request_id, each.protection
+            )
         return protections
 
     @staticmethod

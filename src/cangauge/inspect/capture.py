@@ -17,17 +17,8 @@ import numpy as np
 from can.typechecking import StringPathLike
 
 from cangauge._typing import FloatArray
-from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.mapping import COUNTER
-from cangauge.bus.protection import (
-    RULES,
-    Anomaly,
-    CounterRule,
-    E2eRule,
-    FrameChecker,
-    Protection,
-)
+from cangauge.bus.protection import RULES, Anomaly, FrameChecker, Protection
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import Gap, LogInspection, inspect_log
@@ -136,7 +127,7 @@ def inspect_capture(
         If it cannot be read, or holds no usable frame; with a vehicle, also as `capture_to_log`.
     """
     path = Path(path)
-    capture = open_capture(path) if vehicle is None else open_vehicle_capture(path, vehicle)
+    capture = open_vehicle_capture(path, vehicle)
     stamps_s, error_frames, remote_frames = array("d"), 0, 0
     ids: defaultdict[tuple[str, int, bool], _Frames] = defaultdict(_Frames)
     cars = {name: preset.vehicle() for name, preset in PRESETS.items()}
@@ -181,16 +172,16 @@ def inspect_capture(
 
 # --- Frames by id
 
-_Rule = tuple[Protection, int]
-"""A protection that a vehicle states, and the length of its message."""
+_Rule = tuple[Protection, str, int]
+"""A protection that a vehicle states, its name, and the length of its message."""
 
 
 def _rules_of(vehicle: Vehicle) -> dict[tuple[int, bool], _Rule]:
     """Return the stated protections by id, and whether it is extended."""
     return {
-        (each.arbitration_id, each.is_extended): (rule, each.length)
+        (each.arbitration_id, each.is_extended): (stated.rule, stated.name or "", each.length)
         for each in (*vehicle.signals, *vehicle.cells)
-        if (rule := vehicle.messages[each.key].rule) is not None
+        if (stated := vehicle.messages[each.key]).rule is not None
     }
 
 
@@ -220,8 +211,8 @@ class _Frames:
             known = {
                 "period_s": float(np.median(intervals_s)),
                 "longest_s": float(intervals_s.max()),
+                **self._protection(intervals_s, stated),
             }
-            known |= self._protection(intervals_s, stated)
         return IdSummary(name, bus, len(self.stamps_s), lengths, **known)
 
     def _protection(self, intervals_s: FloatArray, stated: _Rule | None) -> dict[str, Any]:
@@ -230,15 +221,15 @@ class _Frames:
         {} without one.
         """
         length = max(self.lengths)
-        if len(self.lengths) > 1 or length < (3 if stated is None else stated[1]):
+        if len(self.lengths) > 1 or length < (3 if stated is None else stated[2]):
             return {}
         payloads = [self.payloads[at : at + length] for at in range(0, len(self.payloads), length)]
         # Lost frames lengthen intervals: the lower quartile is the period; 0 for equal stamps.
         period_s = float(np.quantile(intervals_s, 0.25)) or None
         if stated is not None:
-            rule, length = stated
+            rule, name, length = stated
             payloads = [data[:length] for data in payloads]
-            return _counts_by(rule, _name_of(rule), payloads, self.stamps_s, period_s)
+            return _counts_by(rule, name, payloads, self.stamps_s, period_s)
         varies = len(set(map(bytes, payloads))) >= PAYLOADS
         for name in ("leaf", "generic") if varies else ():
             rule, first = RULES[name], payloads[:LEARN_FRAMES]
@@ -252,13 +243,6 @@ class _Frames:
                 return {"protection": name, "crc_errors": found["crc_errors"]}
             return found
         return {}
-
-
-def _name_of(rule: Protection) -> str:
-    if isinstance(rule, E2eRule):
-        return rule.name
-    known = (name for name, each in RULES.items() if each == rule)
-    return next(known, COUNTER if isinstance(rule, CounterRule) else "own rule")
 
 
 def _counts_by(

@@ -14,7 +14,6 @@ import can
 import numpy as np
 from can.typechecking import Channel
 
-from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import (
@@ -149,8 +148,6 @@ class CaptureSource:
             yield message
 
     def _messages(self) -> Iterable[can.Message]:
-        if self._vehicle is None:
-            return open_capture(self._path)
         return open_vehicle_capture(self._path, self._vehicle)
 
 
