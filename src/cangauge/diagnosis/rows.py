@@ -118,8 +118,7 @@ class Simulated:
 
 def added(model: ExtendedModel, effect: Effect, values: Values) -> ExtendedModel:
     """Return a model with an effect, added to one of the same shape."""
-    # The one parameter of a skew is amplitude and shape.
-    amplitudes = [item.name for item in effect.amplitudes or effect.parameters[:1]]
+    amplitudes = [item.name for item in effect.amplitudes]
     fixed = values.keys() - amplitudes
     neutral, total, others = effect.neutral(model.pack), dict(values), []
     for other, known in model.effects:

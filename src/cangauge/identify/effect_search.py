@@ -306,8 +306,7 @@ class Search:
         self.refused: list[EffectCandidate] = []
         """Candidates that are not offered any more."""
         self._sums: list[LogSums] = []
-        for number, of_log in enumerate(rows, start=1):
-            _LOG.debug("columns of the effects: log %d of %d", number, len(rows))
+        for of_log in rows:
             linear = linearize(model, of_log, every, np.zeros(len(every.bounds)))
             self._sums.append(log_sums(of_log, pack.chemistry, linear.table))
 

@@ -60,7 +60,7 @@ def fit(
 ) -> Identification:
     """Identify the model of a pack from one or more logs.
 
-    Progress is logged to `cangauge.identify`: decisions at INFO, steps at DEBUG.
+    Decisions are logged to `cangauge.identify` at INFO.
 
     Parameters
     ----------

@@ -61,14 +61,13 @@ class Added:
         Of the model without any of them.
     log_factor : array
         Gain of log evidence (log Bayes factor against that model).
-    mean, std : array
-        Posterior of its coefficient.
+    mean : array
+        Posterior mean of its coefficient.
     """
 
     log_evidence: float
     log_factor: FloatArray
     mean: FloatArray
-    std: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +178,7 @@ class Rows:
         mean = y @ X / precision
         log_factor = 0.5 * (mean**2 * precision - np.log(precision * std**2))
         log_evidence = left.log_norm - 0.5 * float(y @ y)
-        return Added(log_evidence, log_factor, mean, precision**-0.5)
+        return Added(log_evidence, log_factor, mean)
 
 
 def _triangular(table: FloatArray) -> FloatArray:

@@ -41,7 +41,7 @@ def middle(effect: Effect, pack: Pack = PACK) -> dict[str, float]:
     values = {}
     for parameter in effect.parameters:
         low, high = parameter.bounds(pack)
-        if parameter in effect.shapes and effect.amplitudes:
+        if parameter in effect.shapes:
             trials = parameter.trials(pack)
             values[parameter.name] = trials[len(trials) // 2]
         else:

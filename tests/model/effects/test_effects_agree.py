@@ -69,7 +69,7 @@ def test_neutral_values_change_nothing(effect: Effect) -> None:
     for shape in range(max(len(item.grid) for item in effect.parameters) or 1):
         values = effect.neutral(PACK)
         for parameter in effect.parameters:
-            if parameter.grid and effect.amplitudes:
+            if parameter.grid:
                 trials = parameter.trials(PACK)
                 values[parameter.name] = trials[shape % len(trials)]
         extended = plain.with_effect(effect, values)
@@ -127,7 +127,7 @@ def test_amplitudes_enter_the_voltage_nearly_linearly(effect: Effect) -> None:
     rows = np.arange(100, signals.time_s.size)
     base = ExtendedModel(MODEL, CAPACITY_AH)
     neutral = effect.neutral(PACK)
-    for parameter in effect.amplitudes:
+    for parameter in () if effect.moves_time else effect.amplitudes:
         plain = base.predict(signals, 80.0, rows).residual_v
         changes = []
         for part in (0.01, 0.02):

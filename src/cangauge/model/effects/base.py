@@ -12,8 +12,8 @@ Everything is written once, over arrays. A log is one call; the estimator calls 
 row and keeps the effect's `memory` in between. At its neutral values an effect changes nothing.
 
 Parameters are of two kinds. *Amplitudes* have a neutral value and enter the voltage (nearly)
-linearly. *Shapes* (a time constant, a change point) have a grid of trial values and no meaning
-without an amplitude; `time_skew` has a single parameter that is both.
+linearly, except for a shift in time. *Shapes* (a time constant, a change point) have a grid of
+trial values and no meaning without an amplitude.
 
 An effect is a signature at the terminals; it does not prove a mechanism. It sees the model only
 through its pseudo-OCV, the slope of that, and its drop over the resistances.

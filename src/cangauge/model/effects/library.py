@@ -141,15 +141,15 @@ def candidates(effects: Sequence[Effect], pack: Pack) -> list[EffectCandidate]:
     result = []
     for effect in effects:
         neutral = effect.neutral(pack)
-        amplitudes = effect.amplitudes or effect.parameters[:1]  # time_skew's is a shape as well
-        names = tuple(parameter.name for parameter in amplitudes)
+        names = tuple(parameter.name for parameter in effect.amplitudes)
         centre = np.array([neutral[name] for name in names])
-        bounds = np.array([parameter.bounds(pack) for parameter in amplitudes]) - centre[:, None]
+        bounds = (
+            np.array([parameter.bounds(pack) for parameter in effect.amplitudes]) - centre[:, None]
+        )
         small = 0.02 * (bounds[:, 1] - bounds[:, 0])
         steps = np.where(small > bounds[:, 1], -small, small)
-        shapes = effect.shapes if effect.amplitudes else ()
-        grids = [parameter.trials(pack) for parameter in shapes]
+        grids = [parameter.trials(pack) for parameter in effect.shapes]
         for choice in itertools.product(*grids):
-            shape = dict(zip((item.name for item in shapes), choice, strict=True))
+            shape = dict(zip((item.name for item in effect.shapes), choice, strict=True))
             result.append(EffectCandidate(effect, shape, names, centre, bounds, steps))
     return result

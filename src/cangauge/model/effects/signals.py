@@ -93,12 +93,13 @@ class _Waiting:
 
 def skewed_current(signals: Signals, _: Values, at: Context) -> Signals:
     """Return the signals with the current of the moment of their voltage."""
-    return at.memory[0].step(signals, is_last=at.is_whole) if at.memory else signals
+    realigned: Signals = at.memory[0].step(signals, is_last=at.is_whole)
+    return realigned
 
 
 def skew_memory(values: Values, _: Pack) -> Memories:
-    """Return the rows that wait; none without a skew."""
-    return (_Waiting(values["skew_s"]),) if values["skew_s"] else ()
+    """Return the rows that wait."""
+    return (_Waiting(values["skew_s"]),)
 
 
 def skew_form(values: Values, *_: object) -> CoreForm:
@@ -240,38 +241,7 @@ CORRECTIONS: Final = (
     Effect(
         id="time_skew",
         fault="clock",
-        parameters=(
-            Parameter(
-                "skew_s",
-                "s",
-                -4.0,
-                4.0,
-                healthy_std=0.0125,
-                grid=(
-                    -4.0,
-                    -3.0,
-                    -2.0,
-                    -1.5,
-                    -1.0,
-                    -0.7,
-                    -0.5,
-                    -0.35,
-                    -0.2,
-                    -0.1,
-                    0.0,
-                    0.1,
-                    0.2,
-                    0.35,
-                    0.5,
-                    0.7,
-                    1.0,
-                    1.5,
-                    2.0,
-                    3.0,
-                    4.0,
-                ),
-            ),
-        ),
+        parameters=(Parameter("skew_s", "s", -4.0, 4.0, healthy_std=0.0125),),
         about="""
             **Signature.** ∝ R·dI/dt: spikes of either sign at every change of load
 
