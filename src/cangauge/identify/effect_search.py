@@ -368,9 +368,6 @@ class Search:
                 float(gain.mean()) / max(spread, 1e-12),
                 self._t_needed,
             )
-            found.append((item, step, after))
-        return sorted(found, key=_gain, reverse=True)
-
-
-def _gain(compared: tuple[EffectCandidate, SearchStep, FloatArray]) -> float:
-    return compared[1].gain
+            found.append((step.gain, item, step, after))
+        found.sort(key=itemgetter(0), reverse=True)
+        return [each[1:] for each in found]

@@ -28,7 +28,7 @@ from cangauge.identify.least_squares import (
     row_weights,
     solve,
 )
-from cangauge.identify.rows import FitRows, fit_rows
+from cangauge.identify.rows import fit_rows
 from cangauge.logs.gaps import discharged_ah, split_where_moved
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import soc_at_first_row
@@ -142,42 +142,32 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], pack: PackPr
                 starts.append(None if own_pct is None else Start(log, own_pct, "log"))
     known = [start.log for start in starts if start is not None]
     if not known:
-        raise unknown_start(pieces[0], others=len(pieces) > 1)
+        which = "no log states" if len(pieces) > 1 else "the log does not state"
+        raise InputError(
+            f"{which} its SoC (soc_pct), and the curve over SoC cannot begin anywhere",
+            source=pieces[0].source or pieces[0].name,
+            field="soc_pct",
+            cure="give --initial-soc P, the SoC at the first row (100 for a log from full), name"
+            " the SoC (--columns soc=…; for captures [soc] in the map file), or add a log with its"
+            " SoC: the start of the others is then estimated",
+        )
     unknown = [log for log, start in zip(pieces, starts, strict=True) if start is None]
     estimated = iter(_estimated(known, unknown, pack) if unknown else ())
     return [start or next(estimated) for start in starts]
 
 
-def unknown_start(log: Log, *, others: bool) -> InputError:
-    """Return the error for logs of which none states its SoC."""
-    which = "no log states" if others else "the log does not state"
-    return InputError(
-        f"{which} its SoC (soc_pct), and the curve over SoC cannot begin anywhere",
-        source=log.source or log.name,
-        field="soc_pct",
-        cure="give --initial-soc P, the SoC at the first row (100 for a log from full), name the"
-        " SoC (--columns soc=…; for captures [soc] in the map file), or add a log with its SoC: the"
-        " start of the others is then estimated",
-    )
-
-
-@dataclass(frozen=True, eq=False)
 class _Unknown:
     """A log of unknown start: its rows, counted from a start in the middle of the possible ones."""
 
-    log: Log
-    rows: FitRows
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, log: Log, capacity_ah: float) -> _Unknown:
-        low, high = _limits(log, capacity_ah)
-        return cls(log, fit_rows(with_start(log, 0.5 * (low + high)), capacity_ah), low, high)
+    def __init__(self, log: Log, capacity_ah: float) -> None:
+        self.log = log
+        self.low, self.high = _limits(log, capacity_ah)
+        self._middle = 0.5 * (self.low + self.high)
+        self.rows = fit_rows(with_start(log, self._middle), capacity_ah)
 
     def soc_pct(self, start_pct: float) -> FloatArray:
         """Return the SoC of the rows from a start [%]."""
-        return self.rows.soc_pct + start_pct - 0.5 * (self.low + self.high)
+        return self.rows.soc_pct + start_pct - self._middle
 
     def sums(self, start_pct: float, pack: PackPrior) -> LogSums:
         """Return the sums of the log from a start [%]."""
@@ -227,7 +217,7 @@ class _Unknown:
 def _estimated(known: Sequence[Log], logs: Sequence[Log], pack: PackPrior) -> list[Start]:
     """Return the starts of logs, found in turn with the curve, which the known logs pin."""
     pinned = [log_sums(fit_rows(log, pack.capacity_ah), pack.chemistry) for log in known]
-    unknown = [_Unknown.of(log, pack.capacity_ah) for log in logs]
+    unknown = [_Unknown(log, pack.capacity_ah) for log in logs]
     sums, values = pinned, np.full(len(logs), np.nan)
     for _ in range(STEPS_AT_MOST):
         solution, before = solve(sums, pack), values

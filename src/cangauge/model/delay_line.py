@@ -84,7 +84,8 @@ class DelayLine:
         self, delay_s: Sequence[float], *, gap_s: float = GAP_S, spacing_s: float = SPACING_S
     ) -> None:
         self._delays = tuple(delay_s)
-        self._longest = self._delays[-1]
+        self.longest_s = self._delays[-1]
+        """The longest delay [s]."""
         self._gap = gap_s
         self._spacing = spacing_s
         self._times: list[float] = []
@@ -104,15 +105,10 @@ class DelayLine:
         times.append(time_s)
         currents.append(current_a)
         # Many together: deleting the first element of a list at each push costs more.
-        if len(times) > DROPPED + 1 and times[DROPPED + 1] <= time_s - self._longest:
-            stale = bisect_right(times, time_s - self._longest) - 1
+        if len(times) > DROPPED + 1 and times[DROPPED + 1] <= time_s - self.longest_s:
+            stale = bisect_right(times, time_s - self.longest_s) - 1
             del times[:stale]
             del currents[:stale]
-
-    @property
-    def longest_s(self) -> float:
-        """The longest delay [s]."""
-        return self._longest
 
     @property
     def filled_s(self) -> float:

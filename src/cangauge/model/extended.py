@@ -253,8 +253,7 @@ class OnlineModel:
         ]
         self.load_coefficients = self.model.load_coefficients
         """Coefficients of the load columns, shape (k,)."""
-        currents = len(self.model.loads.delays_s) + len(self.model.loads.low_pass_s)
-        self.unseen_v_per_a = float(np.sum(self.load_coefficients[2 : 1 + currents]))
+        self.unseen_v_per_a = float(np.sum(self.model.loads.resistance_ohm[1:]))
         """Voltage by earlier currents, which a slow log shows in part [V/A]."""
         self.load = np.full(self.load_coefficients.size, math.nan)
         """The load row at the latest reading, shape (k,); NaN before any."""
@@ -264,7 +263,6 @@ class OnlineModel:
         The first is the voltage of effects that do not depend on the SoC [V]. The effects' voltage
         is linear in the drives, so that a mean of readings has the mean of their drives.
         """
-        self._slope_at_least = SLOPE_AT_LEAST * self.model.nominal_v
 
     @property
     def load_v(self) -> float:
@@ -359,7 +357,7 @@ class OnlineModel:
             extra = self.extended.add_over_soc(np.zeros(3), at, drives[1:])
             volts += float(extra[1])
             slope += float(extra[2] - extra[0]) / (2.0 * step_pct)
-            slope = max(slope, self._slope_at_least)
+            slope = max(slope, SLOPE_AT_LEAST * self.model.nominal_v)
         return volts, slope
 
     def curve_values(self, soc_pct: FloatArray) -> FloatArray:

@@ -18,7 +18,6 @@ from pydantic import (
 
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
-from cangauge._text import number, significant, span
 from cangauge.errors import InputError, located, naming_arguments
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import start_of
@@ -182,9 +181,9 @@ class Model(Fields):
         if (curve := self.curve) is not None:
             check_shape("curve.voltage_v", curve.voltage_v, len(curve.soc_pct))
         functions, columns = self.functions, self.voltage_model().load_coefficients.size
-        number = len(functions.curve_v)
-        check_shape("functions.curve_v", functions.curve_v, number, len(functions.soc_pct))
-        check_shape("functions.load", functions.load, number, columns)
+        knots = len(functions.soc_pct)
+        check_shape("functions.curve_v", functions.curve_v, functions.number, knots)
+        check_shape("functions.load", functions.load, functions.number, columns)
         if (information := self.information) is not None:
             p = len(information.columns)
             check_shape("information.root", information.root, p, p)
@@ -193,19 +192,11 @@ class Model(Fields):
 
     def __repr__(self) -> str:
         """Return what the model is of and where it holds."""
-        cells = f", {self.cells} cells" if self.cells else ""
-        effects = ", ".join(effect["id"] for effect in self.effects) or "none"
-        error = number(self.noise.voltage_mae_pct, 2, "%")
-        ranges = self.range
-        lines = (
-            f"<Model {self.name!r}",
-            f"{self.equation}, {self.chemistry}{cells}, {significant(self.capacity_ah, 4, 'Ah')}",
-            f"identified at {span(*ranges.soc_pct, 0, '% SoC')},"
-            f" {span(*ranges.temperature_c, 0, '°C')}, {span(*ranges.current_a, 0, 'A')}",
-            f"voltage error {error} on {self.noise.judged_on}",
-            f"effects: {effects}>",
+        low, high = self.range.soc_pct
+        return (
+            f"<Model {self.name!r}: {self.equation}, {self.chemistry}, {self.capacity_ah:.4g} Ah,"
+            f" identified at {low:.0f} … {high:.0f} % SoC>"
         )
-        return "\n  ".join(lines)
 
     @property
     def coefficients(self) -> dict[str, Coefficient]:

@@ -77,7 +77,6 @@ def _fields(given: object, names: Sequence[str], owner: str, field: str) -> Mapp
     raise InputError(
         f"{owner} has the fields {', '.join(names)} only",
         field=field,
-        value=sorted(map(str, given)) if isinstance(given, Mapping) else given,
         cure="fit again",
     )
 
