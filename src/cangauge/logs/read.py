@@ -26,7 +26,6 @@ from cangauge.logs.quantities import FIELDS
 from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
-from cangauge.logs.values import is_number
 from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
@@ -194,7 +193,6 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
     headings, choice = likely_header(head)
     bare = without_header(head)
-    rows = [line.split() for line in head.lines[1:5]]
     shown = head.first_line.strip()
     if foreign is not None:
         kind, cure = foreign
@@ -207,9 +205,6 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
         problem, count = f"{problem}: a table without a header", len(bare.headings)
         named = ",".join(f"{name}=#{k}" for k, name in enumerate([*FIELDS][:count], start=1))
         cure = f"name its {count} columns by number, such as --columns '{named}' ({DOCS})"
-    elif rows and all(len(row) > 2 and all(map(is_number, row)) for row in rows):
-        problem = f"{problem}: its columns are separated by blanks"
-        cure = "separate them by commas: sed -E 's/^ +//; s/ +/,/g' FILE > log.csv"
     else:
         cure += f"; other tables: --columns ({DOCS})"
         if shown and shown.isprintable():

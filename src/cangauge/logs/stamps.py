@@ -237,12 +237,9 @@ def _are_minutes(parts: Any, unit: str, source: str, label: str) -> bool:
         return unit[:1].lower() == "m"
     if np.isfinite(_numbers(parts, "d")).any() or np.any(_words(parts, "half") != ""):
         return False  # only a clock counts days, or halves of one
-    hours, minutes = _numbers(parts, "h"), _numbers(parts, "m")
-    hours, minutes = hours[np.isfinite(hours)], minutes[np.isfinite(hours)]
-    if np.max(hours) < 24.0 and np.any(np.diff(hours) < 0.0):  # from 23:59 to 0:00
-        return False
     problem = "it may be hours and minutes, or minutes and seconds"
-    shown = f"{hours[-1]:.0f}:{minutes[-1]:02.0f}"
+    hour, minute = (pc.drop_null(parts.field(name))[0].as_py() for name in "hm")
+    shown = f"{hour}:{minute}"
     cure = f"state it: --columns 'time={label}[h:mm]', or [mm:ss]"
     raise InputError(problem, source=source, field=label, value=shown, cure=cure)
 

@@ -102,10 +102,12 @@ def draft_of_table(
     name: str,
     source: str,
     besides: Mapping[int, float] | None = None,
+    is_defined: bool = False,
 ) -> DraftLog:
     """Return the draft of a log from a table; `given` are the user's columns.
 
     `besides` are further columns to take, by place, with factors; by default those in Ah.
+    `is_defined`: a format defines columns and sign, as the canonical log does.
 
     Raises
     ------
@@ -118,13 +120,14 @@ def draft_of_table(
         refuse_odd_names(headings, where)
     if not choice.is_complete:
         raise UnknownColumnsError(where, headings, choice, given)
+    is_defined = is_defined or choice.is_canonical
     chosen = choice.chosen
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     measured = [place for column in chosen.values() for place in column.places]
     times = [*chosen["time"].places, *(place for place, _ in chosen["time"].others)]
     taken = [*measured, *times, *words]
     unit_columns = {k: k + 1 for k in taken if _UNITS.search("".join(headings[k + 1 : k + 2]))}
-    counters = {} if choice.is_canonical or "soc" not in chosen else _counters(table, taken)
+    counters = {} if is_defined or "soc" not in chosen else _counters(table, taken)
     others = besides or counters
     wanted = dict.fromkeys([*taken, *unit_columns.values(), *others])
     cells = table.columns([*wanted], times=times, optional=[*counters])
@@ -136,18 +139,18 @@ def draft_of_table(
             chosen[quantity], unit = _take_time(draft, column, cells, beside)
         else:
             unit = _take(draft, quantity, column, cells, beside)
-        if not choice.is_canonical:
+        if not is_defined:
             draft.assumed.append(_assumption(draft, quantity, column.factor, unit))
     _take_besides(draft, cells, others, may_be_words=besides is None)
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
     word: str = chosen["temperature"].source if "temperature" in chosen else "unknown"
-    if choice.is_canonical:
+    if is_defined:
         word = table.word or word
     for place in words:
         word = _only_word(cells[place], where, SOURCE) or word
     draft.temperature_source = known_temperature_source(word, source=where)
-    if not choice.is_canonical:
+    if not is_defined:
         _direct(draft, chosen["current"], table)
         _hold_changes(draft)
     return draft

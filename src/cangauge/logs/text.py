@@ -245,13 +245,16 @@ def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str]
     InputError
         If the header has none of a column of the user.
     """
-    best: list[str] = []
+    found: list[list[str]] = []
     for table in headed(head, rows=1):
         if _values_in(table.headings) > 1:
             break
         below = head.lines[table.skip_lines : table.skip_lines + _ROWS_ABOVE_DATA]
-        has_data = any(_values_in(split_cells(row, table.delimiter)) > 1 for row in below)
-        known, most = (sum(map(bool, map(meaning_of, row))) for row in (table.headings, best))
-        if has_data and (not best or known > most):
-            best = [*table.headings]
+        if any(_values_in(split_cells(row, table.delimiter)) > 1 for row in below):
+            found.append([*table.headings])
+    best = max(found, key=_count_known, default=[])
     return best, choose_columns(best, (), given)
+
+
+def _count_known(headings: Sequence[str]) -> int:
+    return sum(map(bool, map(meaning_of, headings)))

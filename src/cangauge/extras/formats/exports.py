@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 
 from cangauge._files import Head
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.draft import BESIDES, DraftLog
+from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import parse_heading
 from cangauge.logs.quantities import FIELDS
 from cangauge.logs.table import ArrowTable, draft_of_table
@@ -124,26 +124,25 @@ class Export:
         places |= {name: _matching(simple, *each)[:1] for name, each in self.columns.items()}
         places["temperature"] = sensors or _matching(simple, self.ambient)[:1]
         given = {name: "+".join(f"#{k + 1}" for k in each) for name, each in places.items() if each}
-        excluded = _matching(simple, *excludes)[:1]
-        for place in excluded:
-            words = cells[place].cast("string")  # a column of 0 is one of numbers
-            cells[place] = pc.fill_null(pc.equal(words, "Yes"), fill_value=False).cast("float64")
-        table = _table(head, header, {k: cells[k] for k in [*chain(*places.values()), *excluded]})
+        table = _table(head, header, {k: cells[k] for k in chain(*places.values())})
         draft = draft_of_table(
             table,
             ColumnMap(given),
             name=head.name,
             source=str(head.path),
-            besides=dict.fromkeys(excluded, 1.0),
+            is_defined=True,
         )
-        draft.remarks, draft.assumed, draft.in_seconds = [*remarks, *draft.remarks], [], False
-        draft.sign_by = "data" if driving["current"][0] == _CAN else "format"
+        draft.remarks[:0] = remarks
+        draft.headings, draft.ignored, draft.in_seconds = tuple(header), (), False
+        if driving["current"][0] == _CAN:
+            draft.sign_by = "data"
         if self.charges:
             draft.negate_current(f"{self.name} stores discharge as negative")
         self._note_temperature(draft, len(sensors))
-        for place in excluded:
-            is_excluded = draft.values.pop(f"{BESIDES}{header[place]}") > 0.0
-            draft.keep(~is_excluded, "that the cycler excludes dropped")
+        for place in _matching(simple, *excludes)[:1]:
+            words = cells[place].cast("string")  # a column of 0 is one of numbers
+            is_excluded = pc.fill_null(pc.equal(words, "Yes"), fill_value=False)
+            draft.keep(~np.asarray(is_excluded, dtype=bool), "that the cycler excludes dropped")
         if self.waits:
             is_waiting = draft.values["time_s"] < 0.0
             if is_waiting.all():
@@ -219,7 +218,6 @@ def _cycler(name: str, time: str, current: str, voltage: str, *more: str, **how:
 
 
 _SIGNED: Final = r"_(?P<sign>[NP])(?P<value>\d\d)(?=[_.])"
-_BDF: Final = "Battery Data Format"
 READERS: Final = (
     # "Battery and Heating Data in Real Driving Cycles"; its SoC is the car's own.
     Export(
@@ -280,28 +278,12 @@ READERS: Final = (
     # machine-readable names, and the schema of the package battery-data-standard. The former does
     # not state the sign: its net capacity is charge less discharge, so that positive charges, as
     # in the latter. All columns but three are optional, and may be empty.
-    _cycler(
-        _BDF,
-        "test time / s",
-        "current / a",
-        "voltage / v",
-        sensors="surfacetemperaturet.*",
-        ambient="ambienttemperature",
-    ),
-    _cycler(
-        _BDF,
-        "test_time_second",
-        "current_ampere",
-        "voltage_volt",
-        sensors="temperaturet.*",
-        ambient="ambienttemperature",
-    ),
-    _cycler(
-        "battery-data-standard",
-        "test_time_s",
-        "current_a",
-        "voltage_v",
-        sensors="temperaturet.*",
+    Export(
+        "Battery Data Format",
+        (r"test[ _]time( / s|_second|_s)", "current( / a|_ampere|_a)", "voltage( / v|_volt|_v)"),
+        {"time": ("testtime",)},
+        {"": ("current", "voltage")},
+        sensors="(surface)?temperaturet.*",
         ambient="ambienttemperature(deg)?",
     ),
 )

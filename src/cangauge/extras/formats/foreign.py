@@ -89,6 +89,11 @@ _FORMATS: Final = (
         "InfluxDB's line protocol",
         "export it from InfluxDB as CSV: influx query --raw, or influx -format csv",
     ),
+    (
+        rb"[^\n]*+\n(?: *+[-+\d.eE]++(?=\s|$)){3,} *+\r?(\n|$)",
+        "a table: its columns are separated by blanks",
+        "separate them by commas: sed -E 's/^ +//; s/ +/,/g' FILE > log.csv",
+    ),
     # Captures
     (
         rb" *\([\d.]+\) +\S+ +[0-9A-F]+ +\[\d+\].*::",

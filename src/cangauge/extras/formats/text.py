@@ -393,44 +393,24 @@ class AscReader(LineReader):
             time_s = self._time_s
         if error := self._ERROR.match(event):
             return frame(time_s, 0, "", channel=int(error[1]) - 1, is_error_frame=True)
-        if match := self._CLASSIC.match(event):
-            return self._classic(time_s, match.groupdict(), line)
-        if match := self._FD.match(event):
-            return self._fd(time_s, match.groupdict(), line)
+        if match := self._CLASSIC.match(event) or self._FD.match(event):
+            return self._frame(time_s, match.groupdict(), line)
         if self._OF_FRAME.match(event):
             raise ValueError("not a frame")
         return None
 
-    def _classic(self, time_s: float, of: dict[str, str], line: str) -> can.Message:
-        is_remote = of["kind"] == "r"
-        if of["code"] is None and not is_remote:
-            raise ValueError("its length is missing")
-        size = min(int(of["code"] or "0", self._base), 8)
-        return self._frame(time_s, of, size, line, is_remote=is_remote)
-
-    def _fd(self, time_s: float, of: dict[str, str], line: str) -> can.Message:
-        size = int(of["length"])
-        is_remote = size == 0 and of["code"] != "0"
-        if is_remote:
-            size = int(of["code"], 16)
-        flags = {
-            "is_fd": True,
-            "bitrate_switch": of["switch"] == "1",
-            "error_state_indicator": of["state"] == "1",
-        }
-        return self._frame(time_s, of, size, line, is_remote=is_remote, **flags)
-
-    def _frame(
-        self,
-        time_s: float,
-        of: dict[str, str],
-        size: int,
-        line: str,
-        *,
-        is_remote: bool,
-        **flags: bool,
-    ) -> can.Message:
-        """Return the frame of the groups that all frames have, and flags of CAN FD."""
+    def _frame(self, time_s: float, of: dict[str, str], line: str) -> can.Message:
+        """Return the frame of the groups of a classic frame, or of one of CAN FD."""
+        is_fd = "length" in of
+        if is_fd:
+            size = int(of["length"])
+            is_remote = size == 0 and of["code"] != "0"
+            size = int(of["code"], 16) if is_remote else size
+        else:
+            is_remote = of["kind"] == "r"
+            if of["code"] is None and not is_remote:
+                raise ValueError("its length is missing")
+            size = min(int(of["code"] or "0", self._base), 8)
         return frame(
             time_s,
             int(of["id"], self._base),
@@ -439,7 +419,9 @@ class AscReader(LineReader):
             is_extended=bool(of["long"]),
             channel=int(of["channel"]) - 1,
             is_rx=of["way"] == "Rx",
-            **flags,
+            is_fd=is_fd,
+            bitrate_switch=of.get("switch") == "1",
+            error_state_indicator=of.get("state") == "1",
         )
 
     def _data(self, rest: str, size: int, line: str) -> str:
