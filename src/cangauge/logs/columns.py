@@ -12,7 +12,7 @@ from cangauge.errors import InputError, closest
 from cangauge.logs.column_map import DOCS, SYNTAX, ColumnMap, meant_by
 from cangauge.logs.headings import Meaning, Rank, meaning_of, parse_heading
 from cangauge.logs.log import SOURCE
-from cangauge.logs.quantities import FIELDS, QUANTITIES, unit_of
+from cangauge.logs.quantities import FIELDS, QUANTITIES, REQUIRED, unit_of
 from cangauge.settings import TemperatureSource
 
 NEEDED: Final = ("time", "current", "voltage")
@@ -185,13 +185,13 @@ def _canonical(
     names: such a table is a logger's own.
     """
     names = [_simple(heading) for heading in headings]
+    if not set(names).issuperset(REQUIRED[:3]):
+        return None
     chosen = {
         quantity: ChosenColumn((names.index(name),), QUANTITIES[quantity].unit)
         for quantity, name in FIELDS.items()
         if name in names
     }
-    if not chosen.keys() >= set(NEEDED):
-        return None
     if "temperature" not in chosen:
         others = zip(names, meanings, strict=True)
         if any(each and each.quantity == "temperature" and name != SOURCE for name, each in others):

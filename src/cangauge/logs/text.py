@@ -193,7 +193,8 @@ def headed(head: Head, rows: int) -> Iterator[TextTable]:
         if any(len(row) != len(first) or _values_in(row[1:]) for row in second):
             continue
         headings = [" ".join(cells).strip() for cells in zip(first, *second, strict=True)]
-        yield TextTable(head, delimiter, headings, (), number + rows, [])
+        if len(headings) > 2:
+            yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
 def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | None) -> TextTable:
