@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
-from operator import itemgetter
 from typing import Any, Final, Self
 
 import numpy as np
@@ -16,10 +15,9 @@ from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.extras.formats.channels import DRIVING, Channels
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import choose_columns
+from cangauge.logs.columns import Choice, choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.gaps import BRIDGE_S, usual_step_s
-from cangauge.logs.headings import meaning_of
 from cangauge.logs.read import LogTableReader
 from cangauge.logs.stamps import changes_of_clock, over_midnight, seconds_of
 from cangauge.logs.text import MAX_ROWS, TextTable, headed
@@ -152,7 +150,8 @@ class LongTable(Channels):
         for text in headed(head, rows=1):
             lower = {cell.lower() for cell in text.headings}
             is_long = lower.intersection(cls._NAMES) and lower.intersection(cls._VALUES)
-            if is_long and not choose_columns(text.headings).is_complete and _time_of(text):
+            choice = choose_columns(text.headings) if is_long else Choice()
+            if "time" in choice.chosen and not choice.is_complete:
                 return text
         return None
 
@@ -162,8 +161,9 @@ class LongTable(Channels):
         value = next(lower.index(name) for name in cls._VALUES if name in lower)
         named = [place for place, name in enumerate(lower) if name in cls._NAMES]
         units = [place for place, name in enumerate(lower) if name in cls._UNITS]
-        label = _time_of(text)
-        time = text.headings.index(label)
+        column = choose_columns(text.headings).chosen["time"]
+        time = column.places[0]
+        label = text.headings[time]
         cells = text.columns([0, value, time, *named, *units], times=[time])
         # Headers and InfluxDB's notes stand above each table.
         is_note = pc.starts_with(pc.fill_null(cells[0].cast(pa.string()), ""), "#")
@@ -174,7 +174,7 @@ class LongTable(Channels):
         }
         varying = [place for place in named if len(pc.unique(words[place])) > 1] or named[:1]
         source = str(text.head.path)
-        stamps_s, how = seconds_of([cells[time]], "", 1.0, source=source, label=label)
+        stamps_s, how = seconds_of([cells[time]], column.unit, 1.0, source=source, label=label)
         if np.max(stamps_s, initial=0.0) < DAY_S:  # seconds of the day
             stamps_s = over_midnight(stamps_s)
         values, in_cells = _numbers_and_units(cells[value])
@@ -257,13 +257,6 @@ def _rows_by_name(names: Any) -> Iterator[tuple[str, IntArray]]:
     ends = np.cumsum(np.bincount(codes))
     by_code = np.split(np.argsort(codes, kind="stable"), ends)  # none is left behind the last end
     yield from zip(names.dictionary.to_pylist(), by_code, strict=False)
-
-
-def _time_of(text: TextTable) -> str:
-    """Return the most direct heading of time, "" without any."""
-    meanings = [(meaning_of(heading), heading) for heading in text.headings]
-    times = [(m.rank, heading) for m, heading in meanings if m and m.quantity == "time"]
-    return min(times, key=itemgetter(0), default=(0, ""))[1]
 
 
 def _numbers_and_units(cells: Any) -> tuple[FloatArray, Any]:
