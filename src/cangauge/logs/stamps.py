@@ -159,13 +159,12 @@ def _zone_of(name: str) -> ZoneInfo | None:
 
 def _spelled_in_digits(values: FloatArray) -> Any:
     """Return numbers that spell dates as text, or None."""
-    if not np.nanmin(values, initial=np.inf) >= 1e10:
+    if np.nanmin(values, initial=np.inf) < 1e10:
         return None
-    known = values < 1e15
-    digits = pa.array(np.where(known, values, 0.0).astype(np.int64), mask=~known).cast(pa.string())
-    are_dates = pc.all(pc.match_substring_regex(digits, _DIGITS)).as_py()
-    is_whole = known.any() and np.all(values[known] % 1.0 == 0.0)
-    return digits if are_dates and is_whole else None
+    with suppress(pa.ArrowInvalid):  # one is no whole number
+        digits = pa.array(values, from_pandas=True).cast(pa.int64()).cast(pa.string())
+        return digits if pc.all(pc.match_substring_regex(digits, _DIGITS)).as_py() else None
+    return None
 
 
 def _seconds_of_numbers(
