@@ -273,10 +273,10 @@ def _measured(quantity: str, unit: str, words: set[str]) -> Meaning:
     named = {word for word in words if not word.isdigit()}
     is_numbered = len(named) < len(words)
     is_extreme = bool(named & WORDS["extreme"])
-    is_other, source = "12" in words, _UNKNOWN
+    is_temperature, source = quantity == "temperature", _UNKNOWN
     # A number makes it one of several values; above 1, only a word for the pack makes it sure.
     is_part, is_vague = is_numbered, is_numbered and "1" not in words
-    if quantity == "temperature":
+    if is_temperature:
         sources = (place for place, group in _SOURCES.items() if named & WORDS[group])
         source = next(sources, _UNKNOWN)
         if named & WORDS["auxiliary"]:
@@ -285,15 +285,13 @@ def _measured(quantity: str, unit: str, words: set[str]) -> Meaning:
         named -= WORDS["probe"] | WORDS["auxiliary"] | WORDS["extreme"]
         is_numbered = is_numbered or is_extreme
         is_part, is_vague = is_extreme, is_extreme and not named & WORDS["cell"]
-    else:
-        is_other = is_other or is_extreme
     of_cells = WORDS["cell"] | WORDS["display"]
     is_of_pack = bool(named & WORDS["pack"])
     has_unknown = bool(named - WORDS["pack"] - WORDS["neutral"] - WORDS["ambient"] - of_cells)
-    if is_other or named & WORDS["other"]:
+    if named & WORDS["other"] or "12" in words or (is_extreme and not is_temperature):
         rank = Rank.OTHER
     elif named & WORDS["ambient"]:
-        rank = Rank.AMBIENT if quantity == "temperature" else Rank.GUESS
+        rank = Rank.AMBIENT if is_temperature else Rank.GUESS
     elif not is_of_pack and (has_unknown or is_vague):
         rank = Rank.GUESS
     elif has_unknown or is_part:

@@ -212,10 +212,6 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     return InputError(problem, source=head.path, field=field, value=value, cure=cure)
 
 
-def _simple(heading: str) -> str:
-    return heading.strip().lower()
-
-
 def open_log(
     path: str | PathLike[str],
     *,
@@ -257,7 +253,7 @@ def log_of_dataframe(
         raise InputError("not a log", value=type(frame).__name__, cure=cure) from error
     indices = [column for column in table.schema if column.name.startswith("__index_level_")]
     times = [column.name for column in indices if pa.types.is_timestamp(column.type)]
-    if len(times) == 1 and {"time", "time_s"}.isdisjoint(map(_simple, table.column_names)):
+    if len(times) == 1 and {"time", "time_s"}.isdisjoint(map(str.lower, table.column_names)):
         table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)

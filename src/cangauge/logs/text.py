@@ -19,7 +19,7 @@ from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import NEEDED, Choice, choose_columns
 from cangauge.logs.headings import meaning_of
-from cangauge.logs.stamps import count_stamps, is_stamp
+from cangauge.logs.stamps import count_stamps
 from cangauge.logs.values import (
     has_spelled_numbers,
     is_number,
@@ -157,10 +157,6 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(reader, [])]
 
 
-def _is_value(cell: str) -> bool:
-    return is_number(cell) or is_stamp(cell) or bool(unit_in_cell(cell))
-
-
 def _values_in(cells: Sequence[str]) -> int:
     others = [cell for cell in cells if not is_number(cell)]
     return len(cells) - len(others) + count_stamps(others)
@@ -211,7 +207,7 @@ def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | 
     for number, line in enumerate([*above, *below], start=first - len(above)):
         row = split_cells(line, table.delimiter)
         cells = [row[k] for k in measured if k < len(row) and row[k]]
-        is_data = bool(cells) and (_is_value(cells[0]) or _values_in(cells) > 0)
+        is_data = _values_in(cells) > 0 or any(map(unit_in_cell, cells[:1]))
         if is_data and number >= first:
             return table._replace(skip_lines=number)
         if is_data or (number < first and len(row) != len(table.headings)):
