@@ -21,6 +21,7 @@ import cantools.database
 import numpy as np
 from can.typechecking import StringPathLike
 from cantools.database.can import Database, Message, Signal
+from numpy.typing import NDArray
 
 from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
@@ -170,10 +171,9 @@ class SignalCodec:
         """
         for field, values in self.conditions:
             field.put(payload, min(values))
-        self.field.put(payload, self.raw_number(value))
+        self.field.put(payload, self._raw(value))
 
-    def raw_number(self, value: float) -> int:
-        """Return the raw number of a value; raise InputError as `encode_into`."""
+    def _raw(self, value: float) -> int:
         number = ((value - self.shift) / self.gain - self.offset) / self.factor
         if math.isnan(value) and not self.float_format:
             if not self.not_available:
@@ -212,6 +212,12 @@ class SignalCodec:
             high -= 1
         ends = sorted(self.gain * (n * self.factor + self.offset) + self.shift for n in (low, high))
         return ends[0], ends[1]
+
+    def fits(self, values: FloatArray) -> NDArray[np.bool_]:
+        """Return which values `encode_into` can send; NaN counts as one."""
+        raw, (low, high) = self.raw_numbers(values), self.raw_range
+        is_sent = ~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available)))
+        return is_sent | bool(self.float_format)
 
     def raw_numbers(self, values: FloatArray) -> FloatArray:
         """Return the raw numbers of values, NaN for NaN."""

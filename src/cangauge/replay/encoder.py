@@ -7,6 +7,7 @@ from operator import itemgetter
 from typing import Final
 
 import can
+import numpy as np
 
 from cangauge.bus.database import Condition
 from cangauge.bus.time_source import MICROSECONDS
@@ -17,6 +18,8 @@ from cangauge.types import Sample
 
 SLOW_EVERY_S: Final = 1.0
 """Longest interval at which temperature and SoC are sent without a change, in log time [s]."""
+
+_UNITS: Final = {"current": "A", "voltage": "V", "temperature": "°C", "soc_reference": "%"}
 
 
 class FrameEncoder:
@@ -100,21 +103,19 @@ class FrameEncoder:
         """Raise InputError for the first signal that is too narrow for a log, before sending."""
         for signal in self.vehicle.signals:
             column = LOG_COLUMNS[signal.role]
-            values = getattr(log, column)
-            for row, value in enumerate([] if values is None else values.tolist(), start=1):
-                if math.isnan(value):
-                    continue
-                try:
-                    signal.codec.raw_number(value)
-                except InputError as error:
-                    where = f"{signal.codec.name} of {signal.message}"
-                    raise InputError(
-                        f"{error.problem} ({where}); the first such row is {row}",
-                        source=log.source or log.name,
-                        field=column,
-                        value=value,
-                        cure="replay it as another --vehicle",
-                    ) from error
+            if (values := getattr(log, column)) is None:
+                continue
+            bad = np.flatnonzero(~signal.codec.fits(values))
+            if bad.size:
+                row, (low, high) = int(bad[0]), signal.codec.range
+                raise InputError(
+                    f"does not fit into signal {signal.codec.name} of {signal.message}, which holds"
+                    f" {low:g} to {high:g} {_UNITS[signal.role]}; the first such row is {row + 1}",
+                    source=log.source or log.name,
+                    field=column,
+                    value=float(values[row]),
+                    cure="replay it as another --vehicle",
+                )
 
     def quantization(self) -> dict[str, float]:
         """Return the largest quantization errors of frames by column; `time_s` is the clock's."""
