@@ -226,6 +226,8 @@ class Head:
         The first lines of a text, without line ends; empty for binary content.
     text : bytes or None
         What is read in place of the file's content.
+    decimal_mark : str
+        Decimal mark of a table whose numbers do not show it; "" if unknown.
 
     Raises
     ------
@@ -235,6 +237,7 @@ class Head:
     """
 
     text: bytes | None = None
+    decimal_mark: str = ""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self.path = Path(path)

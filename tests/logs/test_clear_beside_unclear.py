@@ -1,4 +1,4 @@
-"""What is clear beside an unclear time or column is read."""
+"""A table of which only one reading makes a log is read; an unclear column beside it is not."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import cangauge
@@ -58,10 +60,36 @@ def test_an_unclear_column_beside_the_log_is_left_out(extra: str, tmp_path: Path
     assert len(log) == ROWS
 
 
-def test_cells_have_the_decimal_mark_of_their_log(tmp_path: Path) -> None:
-    head = "Time [s];Current [mA];Voltage [V];Temperature [°C];Cell 1 [V];Cell 2 [V]"
+def test_the_reading_that_is_taken_is_said(tmp_path: Path) -> None:
+    log = table(
+        tmp_path / "marks.csv",
+        "Time [s];Current [mA];Voltage [mV];Temperature [°C]",
+        lambda k: f"{k};{round(100 * math.sin(k / 7))};3,{800 + k};25",
+    )
+    assert log.voltage_v[0] == pytest.approx(3.8)
+    assert any("the mark in 3,800 separates thousands" in remark for remark in log.remarks)
+
+
+def test_parquet_is_read_like_csv(tmp_path: Path) -> None:
+    columns = {
+        "Time [s]": [str(k) for k in range(ROWS)],
+        "Current [mA]": [str(round(100 * math.sin(k / 7))) for k in range(ROWS)],
+        "Voltage [mV]": [f"3,{800 + k}" for k in range(ROWS)],
+    }
+    pq.write_table(pa.table(columns), tmp_path / "marks.parquet")
+    log = cangauge.read_log(tmp_path / "marks.parquet", temperature_c=25.0)
+    assert log.voltage_v[0] == pytest.approx(3.8)
+
+
+@pytest.mark.parametrize(
+    ("pack", "cell_v"), [("Voltage [V];{v:.2f}", 3.801), ("Voltage [mV];7,{mv}", 3801.0)]
+)
+def test_cells_have_the_decimal_mark_of_their_log(pack: str, cell_v: float, tmp_path: Path) -> None:
+    heading, _, voltage = pack.partition(";")
+    head = f"Time [s];Current [mA];{heading};Temperature [°C];Cell 1 [V];Cell 2 [V]"
     rows = [
-        f"{k};{round(100 * math.sin(k / 7))};{7.6 + 0.01 * (k % 7):.2f};25;3,{800 + k};3,{801 + k}"
+        f"{k};{round(100 * math.sin(k / 7))};"
+        f"{voltage.format(v=7.6 + 0.01 * (k % 7), mv=600 + k)};25;3,{800 + k};3,{801 + k}"
         for k in range(ROWS)
     ]
     path = tmp_path / "cells.csv"
@@ -69,7 +97,7 @@ def test_cells_have_the_decimal_mark_of_their_log(tmp_path: Path) -> None:
     file = open_log(path)
     cells = file.cells(file.read().time_s)
     assert cells is not None
-    assert cells.voltage_v[0, 1] == pytest.approx(3.801)
+    assert cells.voltage_v[0, 1] == pytest.approx(cell_v)
 
 
 def test_a_slow_series_tells_no_daylight_saving_time(tmp_path: Path) -> None:

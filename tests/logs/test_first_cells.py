@@ -33,7 +33,7 @@ def test_a_word_as_first_value_loses_no_decimals(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("early", "late", "expected"),
-    [("20.500", "3,5", 20_500.0), ("20.500", "3.5", 20.5)],
+    [("20.500", "3,5", 20_500.0), ("20.500", "3.5", 20.5), ("20", "20.500", 20.5)],
 )
 def test_rows_below_the_beginning_tell_what_a_mark_means(
     tmp_path: Path, early: str, late: str, expected: float

@@ -8,7 +8,7 @@ from cangauge.bus.recording import read_log
 
 
 def test_points_in_the_times_do_not_make_commas_of_values_thousands(tmp_path: Path) -> None:
-    row = "{k}.1;HV current;1{a},12;A\n{k}.2;HV voltage;360,25;V\n{k}.3;HV temperature;25;C\n"
+    row = "{k}.1;HV current;1{a},125;A\n{k}.2;HV voltage;360,250;V\n{k}.3;HV temperature;25;C\n"
     path = tmp_path / "t.csv"
     rows = "".join(row.format(k=k, a=k % 7) for k in range(600))
     path.write_text(f"SECONDS;PID;VALUE;UNITS\n{rows}")

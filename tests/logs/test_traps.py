@@ -180,6 +180,20 @@ def test_numbers_without_a_unit_are_seconds_if_only_they_fit(
     read(tmp_path, "Time,Current,Voltage,Temp", rows, "time=Time[s]")
 
 
+@pytest.mark.parametrize(("step_s", "per_row"), [(20.0, 20), (0.02, 20), (1.0, 1)])
+def test_a_soc_tells_seconds_from_milliseconds(tmp_path: Path, step_s: float, per_row: int) -> None:
+    """Of a pack of 60 Ah at 60 A, by rows of 20 s or of 20 ms."""
+    rows = [
+        f"{per_row * k},{60 + k % 7},360,20,{90 - 100 * step_s * k / 3600:.3f}" for k in range(60)
+    ]
+    if step_s == per_row:
+        log = read(tmp_path, "Time,Current,Voltage,Temp,SoC", rows)
+        assert log.time_s[1] - log.time_s[0] == step_s
+    else:
+        with pytest.raises(InputError, match="in seconds or another unit"):
+            read(tmp_path, "Time,Current,Voltage,Temp,SoC", rows)
+
+
 def test_stamps_of_whole_seconds_at_2_hz_are_read_and_of_whole_minutes_refused(
     tmp_path: Path,
 ) -> None:
@@ -391,7 +405,8 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
         ("1,800", "380.5", (1800.0, 380.5)),  # one mark is decimal in this table
         ("1.800", "380,5", (1800.0, 380.5)),
         ("1,800", "380", None),  # nothing tells
-        ("1,800", "380,500", None),
+        ("1,800", "380.500", (1800.0, 380.5)),  # no battery has 380,500 V …
+        ("1,800", "380,500", (1.8, 380.5)),
         ("1,80", "380.5", (1.8, 380.5)),  # each column its own
         ("1.800;20,5", "380.5", (1.8, 380.5)),  # both are decimal
     ],

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from typing import Final
@@ -19,7 +20,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
-from cangauge.logs.charge import with_own_count
+from cangauge.logs.charge import implied_capacity, with_own_count
 from cangauge.logs.log import Log
 from cangauge.logs.quantities import LIMITS, QUANTITIES
 from cangauge.logs.resolution import wrapped_current
@@ -244,6 +245,11 @@ def _other_units(log: Log, finer: list[str], coarser: list[str]) -> list[str]:
     step = np.diff(log.time_s)
     # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
     if finer and np.all(log.time_s % 1.0 == 0.0) and np.min(step) >= 10.0:
+        with suppress(InputError):  # in the finer unit, a SoC may need a current of many C
+            capacity_ah = abs(implied_capacity([log], least_pct=0.0).capacity_ah)
+            rms_a = float(np.sqrt(np.mean(log.current_a**2)))
+            if rms_a > LIMITS["c_rate_per_h"] * capacity_ah * _seconds(finer[0]):
+                return []
         return finer
     mean = float(step.mean())
     parts = [1000.0 * mean, *(mean * _seconds(unit) for unit in coarser)]
@@ -293,12 +299,21 @@ def _of_current(log: Log) -> Iterator[_Doubt]:
         problem = f"the current wraps at {wraps_at_a:.10g} A ({bit_field}): {WRAPPED}"
         cure = f"read it as signed: {wraps_at_a:.10g} A less, from half of that on"
         yield amps[np.argmax(np.abs(amps))], problem, cure, []
-    size = np.abs(amps)
-    if np.mean(size > most) > LIMITS["odd_share"]:
-        row = int(np.argmax(size))
-        what = f"current exceeds {most:g} A in row {row + 1}: it"
-        yield _in_finer_unit(float(amps[row]), most, "amperes", what)
-    yield from _odd_row(amps, -most, most, "a battery's current")
+    for odd in _odd_row(amps, -most, most, "a battery's current"):
+        size = np.abs(amps)
+        is_large = size > most
+        are_few = amps.size > 1000 and np.mean(is_large) < LIMITS["odd_share"]
+        if not are_few and not all(map(_is_code, set(size[is_large]))):
+            row = int(np.argmax(size))
+            what = f"current exceeds {most:g} A in row {row + 1}: it"
+            yield _in_finer_unit(float(amps[row]), most, "amperes", what)
+        yield odd
+
+
+def _is_code(value: float) -> bool:
+    """Return whether all bits of its digits are set (65535), or but the last or the highest."""
+    number = int(f"{value:f}".replace(".", "").strip("0"))
+    return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
 
 
 def _of_soc(soc_pct: FloatArray | None, *, is_stated: bool) -> Iterator[_Doubt]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,8 @@ def parquet_table(head: Head) -> ArrowTable:
             if count > limit:
                 problem = f"more than the {limit} {what} that a log may have"
                 raise InputError(problem, source=head.path, value=count, cure="split it")
-        return table_of_schema(file.schema_arrow, read, str(head.path))
+        table = table_of_schema(file.schema_arrow, read, str(head.path))
+        return replace(table, decimal_mark=head.decimal_mark)
 
 
 @contextmanager

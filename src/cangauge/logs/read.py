@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -26,6 +27,7 @@ from cangauge.logs.quantities import FIELDS
 from cangauge.logs.sign import Sign
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header, without_header
+from cangauge.logs.values import UnclearMarkError
 from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
@@ -134,8 +136,32 @@ class LogFile:
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
     ) -> Log:
-        """Read the log; arguments and errors as of `cangauge.read_log`."""
+        """Read the log; arguments and errors as of `cangauge.read_log`.
+
+        If a mark is unclear (`3,800`) and only one reading of it makes a log, it is taken.
+        """
         require_temperature(temperature_c)
+        self.head.decimal_mark = ""
+        try:
+            return self._read(temperature_c, temperature_source)
+        except UnclearMarkError as error:
+            logs = dict[str, Log]()
+            for mark in (",", "."):
+                self.head.decimal_mark = mark
+                with suppress(InputError):
+                    logs[mark] = self._read(temperature_c, temperature_source)
+            if len(logs) != 1:
+                raise
+            ((mark, log),) = logs.items()
+            self.head.decimal_mark = mark
+            taken = "decimals" if mark in str(error.value) else "thousands"
+            remark = f"{error.field}: the mark in {error.value} separates {taken}"
+            remark += "; the other reading makes no log"
+            return replace(log, remarks=(*log.remarks, remark))
+
+    def _read(
+        self, temperature_c: float | None, temperature_source: TemperatureSource | None
+    ) -> Log:
         reader = self.reader
         if reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")

@@ -79,6 +79,7 @@ class ArrowTable:
     source: str | None = None
     units: Sequence[str] = ()
     remarks: list[str] = field(default_factory=list)
+    decimal_mark: str = ""
 
     def columns(
         self,
@@ -92,7 +93,8 @@ class ArrowTable:
             refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         columns = {place: table.column(name) for place, name in zip(places, names, strict=True)}
-        return read_cells(columns, self.headings, self.source, times=times, optional=optional)
+        source, mark = self.source, self.decimal_mark
+        return read_cells(columns, self.headings, source, mark, times=times, optional=optional)
 
 
 def draft_of_table(

@@ -94,8 +94,8 @@ class TextTable(NamedTuple):
             self.remarks.append(f"the last line has no line end: {doubt}")
         headings = [*self.headings, *repeat("", width)]
         columns = {place: table.column(names[place]) for place in places}
-        source = str(self.head.path)
-        return read_cells(columns, headings, source, times=times, optional=optional)
+        source, mark = str(self.head.path), self.head.decimal_mark
+        return read_cells(columns, headings, source, mark, times=times, optional=optional)
 
     def _parsed(
         self, data: bytes, names: list[str], types: Mapping[str, Any]

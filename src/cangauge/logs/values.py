@@ -26,6 +26,10 @@ _MARKS: Final = {",": ".", ".": ","}
 """What separates decimals, and what then may separate thousands."""
 
 
+class UnclearMarkError(InputError):
+    """A mark may separate thousands or decimals, and no number of the table shows which."""
+
+
 def is_number(text: str) -> bool:
     """Return whether a text is a number; its decimal mark may be a comma."""
     try:
@@ -60,6 +64,7 @@ def read_cells(
     columns: Mapping[int, Any],
     headings: Sequence[str],
     source: str | None,
+    decimal_mark: str = "",
     *,
     times: Collection[int] = (),
     optional: Collection[int] = (),
@@ -68,12 +73,12 @@ def read_cells(
 
     Missing values, and headers repeated by a restarted logger, become null. Numbers may be spelled
     in any way (`−1'800,5 V`). The decimal mark of a column is the one that its own numbers prove,
-    else that of the table's other columns. Decimal points in `times` prove nothing for the others:
-    programs write them beside decimal commas.
+    else that of the table's other columns, else `decimal_mark`. Decimal points in `times` prove
+    nothing for the others: programs write them beside decimal commas.
 
     Raises
     ------
-    InputError
+    UnclearMarkError
         If a mark may separate thousands or decimals (`3,800`). An `optional` column stays text.
     """
     texts = {
@@ -97,7 +102,7 @@ def read_cells(
         if mark == "," or place not in times
     }
     for place, cells in numbers.items():
-        marks = proven[place] if len(proven[place]) == 1 else of_table
+        marks = proven[place] if len(proven[place]) == 1 else of_table or {*decimal_mark}
         if marks:
             thousands = _MARKS[min(marks)] if len(marks) == 1 else "'"
             bare = pc.replace_substring(pc.replace_substring(cells, thousands, ""), ",", ".")
@@ -178,7 +183,7 @@ def _decimal_marks(numbers: Any) -> set[str]:
 
 
 def _refuse_unclear(numbers: Any, source: str | None, label: str) -> None:
-    """Raise InputError if a mark may separate thousands as well as decimals.
+    """Raise UnclearMarkError if a mark may separate thousands as well as decimals.
 
     A point is decimal, as programs write it, unless `1.800` stands beside `950`: programs write
     either all decimals in all cells or no trailing zeros.
@@ -191,7 +196,7 @@ def _refuse_unclear(numbers: Any, source: str | None, label: str) -> None:
         plain = re.sub("[.,]", "", text)
         problem = f"it may be {text.replace(',', '.')} or {plain}: three digits follow each mark"
         cure = "export the numbers without marks of thousands, with a decimal point"
-        raise InputError(problem, source=source, field=label, value=text, cure=cure)
+        raise UnclearMarkError(problem, source=source, field=label, value=text, cure=cure)
 
 
 def _any(cells: Any, pattern: str) -> bool:
