@@ -1,7 +1,7 @@
 """What `cangauge init` finds on captures of other makes, without a DBC.
 
 The drives are real (BMW i3 at 10 Hz, BatICM's car at 1 Hz); they are encoded in the published
-layouts of other makes, among 70–110 ids that a car has beside: wheel speeds, torque, motor and
+layouts of other makes, among 60–110 ids that a car has beside: wheel speeds, torque, motor and
 DC/DC currents, power, limits, cells, counters, CRCs, energy and clock. The search was worked on
 with the makes of DEVELOPMENT; HELD_OUT was frozen before, and is evaluated only.
 

@@ -183,8 +183,8 @@ def main() -> int:
 
         measured("none")
         for number, text in (
-            (signal.SIGKILL, "HTTP and MQTT program killed"),
-            (signal.SIGSTOP, "HTTP and MQTT program stopped"),
+            (signal.SIGKILL, "network process killed"),
+            (signal.SIGSTOP, "network process stopped"),
         ):
             with live(folder) as served:
                 served.send_signal(number)
@@ -201,7 +201,7 @@ def main() -> int:
                 measured("600 clients that read nothing")
         measured("none")
     before = rows[0][2]
-    table = Table("attack", "longest interval of SOC_ESTIMATE [s]", "estimator's memory [MB]")
+    table = Table("attack", "longest interval of SOC_ESTIMATE [s]", "service's memory [MB]")
     for attack, gap_s, size_mb in rows:
         table.add_row(attack, f"{gap_s:.3f}", f"{size_mb:.0f}")
     publish(

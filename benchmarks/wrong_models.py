@@ -112,7 +112,7 @@ def main() -> None:
             name, what, start, str(len(found)), f"{100 * mean['valid']:.0f} %",
             f"{100 * mean['wrong']:.1f} %",
             f"{100 * np.mean(within):.0f} %" if within else "–",
-            f"{len(ends)} of {len(found)}", f"{np.median(ends):.0f} min" if ends else "–",
+            str(len(ends)), f"{np.median(ends):.0f} min" if ends else "–",
         )  # fmt: skip
     describes = [f"src/cangauge/{name}" for name in ("model", "identify", "estimation")]
     publish("wrong-models", [table], describes, keeps=options.keep)

@@ -111,24 +111,24 @@ def tables(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> li
     rows = [(x, Posterior(p, ALARM, stated)) for x, p in zip(examples, found, strict=True)]
     known = [(x, p) for x, p in rows if x.truth["fault"] in FAULTS]
     groups: list[tuple[str, Callable[[Example], bool]]] = [
-        ("one floor or more, recorded", lambda x: x.floors >= 1 and x.world != "simulated"),
-        ("one floor or more, simulated", lambda x: x.floors >= 1 and x.world == "simulated"),
+        ("recorded", lambda x: x.floors >= 1 and x.world != "simulated"),
+        ("simulated", lambda x: x.floors >= 1 and x.world == "simulated"),
         ("1 to 2 floors", lambda x: 1 <= x.floors < 2),
         ("above 2 floors", lambda x: x.floors >= 2),
         ("below one floor", lambda x: x.floors < 1),
-        ("one floor or more, 10 references", lambda x: x.floors >= 1 and x.references >= 10),
-        ("one floor or more, 2 to 6 logs", lambda x: x.floors >= 1 and x.logs > 1),
+        ("10 references or more", lambda x: x.floors >= 1 and x.references >= 10),
+        ("2 to 6 diagnosed logs", lambda x: x.floors >= 1 and x.logs > 1),
     ]
     packs = sorted({x.pack for x, _ in known if x.world != "simulated"})
     groups += [
-        (f"one floor or more, {k}", lambda x, k=k: x.floors >= 1 and x.pack == k)  # type: ignore[misc]
+        (k, lambda x, k=k: x.floors >= 1 and x.pack == k)  # type: ignore[misc]
         for k in packs
     ]
     by_group = Table(
-        "group of cases",
+        "group (one floor or more, unless stated)",
         "cases",
         "right fault first",
-        "right fault in first two",
+        "right fault first or second",
         "one fault stated",
         "stated fault right",
         "gap reported",
@@ -140,9 +140,15 @@ def tables(examples: Sequence[Example], found: Sequence[dict[str, float]]) -> li
     healthy = [p.level for x, p in rows if x.truth["fault"] == NONE]
     whole.add_row("healthy logs with a gap", f"{healthy.count('gap')} of {len(healthy)}")
     whole.add_row("healthy logs with a likely gap", f"{healthy.count('likely')} of {len(healthy)}")
-    whole.add_row("P(first fault) → share right (cases)", _calibration(rows))
+    whole.add_row(
+        "mean probability of the first fault → share of cases where it is right (number of cases)",
+        _calibration(rows),
+    )
     alike = [x.truth["fault"] in ALIKE[p.alike] for x, p in rows if p.alike is not None]
-    whole.add_row("group of faults that look alike: right", f"{sum(alike)} of {len(alike)}")
+    whole.add_row(
+        "named group of faults that look alike contains the right fault",
+        f"{sum(alike)} of {len(alike)}",
+    )
     for measure, value in _corrections(rows):
         whole.add_row(measure, value)
     return [by_group, whole]
