@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge._files import MIB
+from cangauge._files import MIB, Head
 from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.readers import capture_readers
@@ -163,6 +163,15 @@ def test_a_pipe_is_refused_and_not_waited_for(reader: str, tmp_path: Path) -> No
     os.mkfifo(tmp_path / "file")
     with pytest.raises(InputError, match=r"this is a pipe \(FIFO\), not a file"):
         READERS[reader](tmp_path / "file")
+
+
+def test_a_long_name_in_a_zip_costs_no_time(tmp_path: Path) -> None:
+    path = tmp_path / "log.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a" + 20_000 * ".gz" + "x", LOG)
+    began_s = time.process_time()
+    assert Head(path).name.endswith(".gzx")
+    assert time.process_time() - began_s < WITHIN_S
 
 
 def stated_by_gzip(path: Path) -> None:
