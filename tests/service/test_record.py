@@ -185,6 +185,11 @@ def test_impossible_recordings_are_refused(tmp_path: Path) -> None:
     for name in ("drive.asc", "drive.csv", "drive", "drive.gz"):
         with pytest.raises(InputError, match="candump"):
             check_recording(tmp_path / name, None, None)
+    os.mkfifo(tmp_path / "pipe.log")
+    (tmp_path / "null.log").symlink_to(os.devnull)
+    for name in ("pipe.log", "null.log"):
+        with pytest.raises(InputError, match="a device or a pipe"):
+            check_recording(tmp_path / name, None, None)
     with closing(Recorder(tmp_path / "private.log")):
         pass
     assert (tmp_path / "private.log").stat().st_mode & 0o777 == 0o640 & ~_umask()

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import can
 
-from cangauge._files import FULL, check_writable, written_name
+from cangauge._files import FULL, check_writable, is_device, written_name
 from cangauge._logging import emit
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
@@ -232,6 +232,13 @@ def check_recording(path: Path, part_mb: float | None, keep_mb: float | None) ->
             source=path,
             field="--record",
             cure="name a .log or .log.gz file; `python -m can.logconvert` turns it into others",
+        )
+    if is_device(path):  # otherwise the next run of this name: a file in /dev, in memory
+        raise InputError(
+            "a recording is a file, and this is a device or a pipe",
+            source=path,
+            field="--record",
+            cure="name a file",
         )
     if keep_mb is not None and part_mb is None:
         raise InputError(
