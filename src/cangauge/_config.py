@@ -12,19 +12,12 @@ from typing import Any, Final, TypeVar, get_args, get_type_hints
 from pydantic import BaseModel, ValidationError
 
 from cangauge._files import read_bounded
-from cangauge.errors import InputError, closest, located
+from cangauge.errors import InputError, closest, in_our_words, located
 
 MAX_TOML_BYTES: Final = 64 * 1024
 _LONG_KEY: Final = re.compile(rb"""(?<![\w"'.-])(?:["']?[\w-]+["']?[ \t]*\.[ \t]*){200}""")
 _UNION_TAGS: Final = {"bool", "int", "float", "str", "constrained-int", "constrained-float"}
 _UNKNOWN_KEY: Final = {"extra_forbidden", "unexpected_keyword_argument"}  # of models, dataclasses
-# Wording of pydantic, and the shorter one of our messages.
-_WORDING: Final = (
-    ("Value error, ", ""),
-    ("Input should be", "must be"),
-    ("greater than or equal to", "at least"),
-    ("less than or equal to", "at most"),
-)
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -87,8 +80,7 @@ def schema_error(
     elif first["type"] in {"model_type", "model_attributes_type", "dict_type", "dataclass_type"}:
         problem = "must be a table"
     else:
-        for theirs, ours in _WORDING:
-            problem = problem.replace(theirs, ours, 1)
+        problem = in_our_words(problem)
         problem = problem[0].lower() + problem[1:]
     return InputError(
         problem,

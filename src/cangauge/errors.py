@@ -183,6 +183,24 @@ def require_temperature(value_c: float | None) -> None:
         )
 
 
+# Wording of pydantic, and the shorter one of our messages.
+_WORDING: Final = (
+    ("Value error, ", ""),
+    ("Input should be", "must be"),
+    ("greater than or equal to", "at least"),
+    ("less than or equal to", "at most"),
+    (", unable to parse string as a number", ""),
+    (", unable to parse string as an integer", ""),
+)
+
+
+def in_our_words(text: str) -> str:
+    """Return a message of pydantic, or of typer, which asks it, in the words of our messages."""
+    for theirs, ours in _WORDING:
+        text = text.replace(theirs, ours, 1)
+    return text
+
+
 # Text quoted from a file may have any length [characters].
 _LONGEST_VALUE: Final = 160
 _LONGEST_TEXT: Final = 600

@@ -162,7 +162,9 @@ def test_only_a_slow_log_notes_its_gaps(made: Path, every: int, gap_s: float) ->
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--method ukf", ["'--method'", "'ukf' is not one of 'ekf', 'newton', 'coulomb'"]),
+        ("--method ukf", ["'--method': 'ukf' is not one of 'ekf', 'newton', 'coulomb'"]),
+        ("--sign plus", ["'--sign': 'plus' is not one of 'charge', 'discharge'"]),
+        ("--temperature warm", ["'--temperature': must be a valid number; see"]),
         ("--initial-soc half", ["--initial-soc", "half"]),
         ("--initial-soc 101", ["--initial-soc", "101"]),
         ("--initial-soc-std -1", ["--initial-soc-std", "-1"]),

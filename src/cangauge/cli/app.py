@@ -22,7 +22,7 @@ from typer.main import get_command as build_command
 from cangauge._files import FULL
 from cangauge._version import __version__
 from cangauge.cli.output import emit_json, hold_remarks, note, print_remarks
-from cangauge.errors import CangaugeError, closest
+from cangauge.errors import CangaugeError, closest, in_our_words
 
 FIRST: Final = (
     "demo",
@@ -190,7 +190,7 @@ def _usage(error: Any) -> tuple[str, str | None]:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"
         field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
+    text = in_our_words(" ".join(error.format_message().split()))
     if options := getattr(error, "possibilities", None):
         text = f"no such option: {field}" + _suggestion(str(field), options)
     if not text or type(error).__name__ == "NoArgsIsHelpError":

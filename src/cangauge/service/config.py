@@ -147,7 +147,14 @@ _NO_FILE: Final = "the configuration"
 
 
 def _none_for_auto(value: object) -> object:
-    return None if value == "auto" else value
+    if value == "auto":
+        return None
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            raise ValueError("neither a number nor auto") from None
+    return value
 
 
 class RunConfig(BaseModel):
