@@ -74,6 +74,15 @@ def test_functions_reproduce_the_covariance_of_the_voltage(model: Model) -> None
         assert reduced == pytest.approx(exact, rel=0.05)
 
 
+def test_prints_where_it_holds_and_how_well(model: Model) -> None:
+    """With `print`, and in a notebook."""
+    corrected = model.model_validate(model.model_dump() | {"effects": [offset_a(1.0)]})
+    for text in (str(corrected), repr(corrected)):
+        for part in ("oxide", "% SoC", "°C", "voltage error", "effects: current_offset"):
+            assert part in text
+        assert len(text) < 250
+
+
 def test_prior_is_a_model_of_its_chemistry() -> None:
     model = Model.prior("lfp", cells=16, capacity_ah=100.0)
     assert model.voltage_model().nominal_v == pytest.approx(16 * 3.29, rel=0.01)
@@ -111,6 +120,10 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
     assert model.predict(unknown, initial_soc_pct=90.0).soc_pct[0] == 90.0
 
 
+def offset_a(value: object) -> dict[str, object]:
+    return {"id": "current_offset", "parameters": {"offset_a": value}}
+
+
 @pytest.mark.parametrize(
     ("break_it", "field"),
     [
@@ -137,6 +150,8 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
         (lambda raw: raw["noise"].update(level_std_v=-1.0), "noise.level_std_v"),
         (lambda raw: raw["functions"]["load"].pop(), "functions.load"),
         (lambda raw: raw.update(effects=[{"id": "hysteresis"}]), "effects.0"),
+        (lambda raw: raw.update(effects=[offset_a(1.0), offset_a(2.0)]), "effects.1.id"),
+        (lambda raw: raw.update(effects=[offset_a("x")]), "effects.0.parameters.offset_a"),
         (lambda raw: raw.update(surprise=1), "surprise"),
         (lambda raw: raw["information"]["root"].pop(), "information.root"),
     ],
@@ -150,6 +165,7 @@ def test_names_the_invalid_field(model: Model, tmp_path: Path, break_it, field) 
         Model.load(path)
     assert error.value.source == str(path)
     assert error.value.field == field
+    assert error.value.cure
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "[" * 100_000, '{"format": NaN}', "\x00"])
@@ -175,5 +191,5 @@ def test_half_of_a_surrogate_pair_is_no_name(model: Model, tmp_path: Path) -> No
 
 
 def test_names_the_path_of_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere\.json.*no such file"):
+    with pytest.raises(InputError, match=r"nowhere\.json: no such file; .*`cangauge fit`"):
         Model.load(tmp_path / "nowhere.json")

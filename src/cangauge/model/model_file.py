@@ -18,6 +18,7 @@ from pydantic import (
 
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
+from cangauge._text import number, span
 from cangauge.errors import InputError, located, naming_arguments
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import start_of
@@ -191,12 +192,17 @@ class Model(Fields):
         return self
 
     def __repr__(self) -> str:
-        """Return what the model is of and where it holds."""
-        low, high = self.range.soc_pct
+        """Return what the model is of, where it holds, and how well."""
+        ranges = self.range
+        effects = ", ".join(effect["id"] for effect in self.effects) or "none"
         return (
-            f"<Model {self.name!r}: {self.equation}, {self.chemistry}, {self.capacity_ah:.4g} Ah,"
-            f" identified at {low:.0f} … {high:.0f} % SoC>"
+            f"<Model {self.name!r}: {self.equation}, {self.chemistry}, {self.capacity_ah:.4g} Ah;"
+            f" identified at {span(*ranges.soc_pct, 0, '% SoC')},"
+            f" {span(*ranges.temperature_c, 0, '°C')};"
+            f" voltage error {number(self.noise.voltage_mae_pct, 2, '%')}; effects: {effects}>"
         )
+
+    __str__ = __repr__
 
     @property
     def coefficients(self) -> dict[str, Coefficient]:
@@ -299,7 +305,13 @@ class Model(Fields):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = as_path(path)
-        data = read_bounded(path, 4 * MIB, "a model file")
+        try:
+            data = read_bounded(path, 4 * MIB, "a model file")
+        except InputError as error:
+            if isinstance(error.__cause__, FileNotFoundError):
+                cure = f"{error.cure}, or {CURE}"
+                raise InputError(error.problem, source=path, cure=cure) from error
+            raise
         with located(path):
             try:
                 raw = json.loads(data)

@@ -14,6 +14,7 @@ from cangauge.errors import InputError
 from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack, Parameter, Values
 from cangauge.model.effects.signals import CORRECTIONS, COUNTS
 from cangauge.model.effects.voltages import VOLTAGES
+from cangauge.model.fields import CURE
 
 LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in (*CORRECTIONS, *COUNTS, *VOLTAGES)}
 """Effect id → effect, in the order in which effects are applied."""
@@ -65,7 +66,7 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
         }
         # Two elements with different time constants form a chain; the same one twice is an error.
         if shape_key(effect, values) in {shape_key(*other) for other in parsed}:
-            raise InputError("given twice", field=f"{field}.id", value=effect.id)
+            raise InputError("given twice", field=f"{field}.id", value=effect.id, cure=CURE)
         parsed.append((effect, values))
     return parsed
 
@@ -86,7 +87,7 @@ def _value(parameter: Parameter, given: object, pack: Pack, field: str) -> float
     low, high = parameter.bounds(pack, BOUND_MARGIN)
     rounding = 1e-9 * (high - low)
     if isinstance(given, bool) or not isinstance(given, int | float):
-        raise InputError("must be a number", field=field, value=given)
+        raise InputError("must be a number", field=field, value=given, cure=CURE)
     # Not a number, and an integer beyond any float, are outside too.
     if not low - rounding <= given <= high + rounding:
         raise InputError(
