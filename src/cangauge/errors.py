@@ -106,7 +106,7 @@ def located(source: str | PathLike[str] | None, field: str = "") -> Iterator[Non
         ) from error
 
 
-_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?=['\d]))?")
+_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)(?: (from-soc)|( (?=['\d])))?")
 _ARGUMENTS: Final = {
     "temperature": "temperature_c",
     "initial-soc": "initial_soc_pct",
@@ -124,7 +124,9 @@ def naming_arguments(function: Callable[P, T]) -> Callable[P, T]:
 
     def argument(option: re.Match[str]) -> str:
         name = _ARGUMENTS.get(option[1], option[1].replace("-", "_"))
-        return f"{name}=" if option[2] else name
+        if option[2]:
+            return f'{name}="{option[2]}"'
+        return f"{name}=" if option[3] else name
 
     def named(text: str | None) -> str | None:
         return text and _OPTION.sub(argument, text)

@@ -300,7 +300,7 @@ def test_capacity_needs_a_log_from_full_to_empty() -> None:
     referenced = synthetic_log(start_pct=90.0, end_pct=30.0)
     with pytest.raises(InputError, match="--capacity-ah A, or --capacity-ah from-soc"):
         fit([referenced])
-    with pytest.raises(InputError, match="capacity_ah A, or capacity_ah from-soc"):
+    with pytest.raises(InputError, match='capacity_ah A, or capacity_ah="from-soc"'):
         cangauge.fit([referenced])
     assert capacity_from_reference([referenced]) == pytest.approx(CAPACITY_AH, rel=1e-3)
     model = fit(referenced, capacity_ah="from-soc").model
