@@ -37,6 +37,18 @@ def logs() -> list[Log]:
     return [day(seed) for seed in (31, 32)]
 
 
+@pytest.mark.parametrize(("off_v", "fault_v"), [(6.0, 6.0), (0.0, 8.0)])
+def test_the_level_of_a_simulator_is_that_on_healthy_logs(
+    logs: list[Log], model: Model, off_v: float, fault_v: float
+) -> None:
+    """The voltage of a faulty log may hide it, or look like one."""
+    faulty = [replace(log, voltage_v=log.voltage_v + fault_v) for log in logs]
+    references = [day(seed) for seed in (33, 34, 35)]
+    found = diagnose(faulty, model, references, simulation=Simulator(volts=off_v))
+    assert ("6.0 V too high everywhere" in found.summary) == (off_v > 0.0)
+    assert ("Correct its level first" in found.summary) == (off_v > 0.0)
+
+
 def test_a_simulator_that_is_off_everywhere_is_told_first(logs: list[Log], model: Model) -> None:
     found = diagnose(logs, model, simulation=Simulator(volts=6.0))
     first = found.summary.splitlines()[0]

@@ -110,13 +110,15 @@ def simulator_gap(
         replace(log, voltage_v=model.predict(output).voltage_v + log.voltage_v - output.voltage_v)
         for log, output in zip(every, outputs, strict=True)
     )
-    gap_v = np.concatenate([log.voltage_v - each for log, each in zip(logs, volts, strict=False)])
-    remark = _level_remark(gap_v, float(np.mean(logs[0].voltage_v)))
+    gaps_v = [log.voltage_v - each for log, each in zip(every, volts, strict=True)]
+    # Healthy logs show the level where there are any: a fault may hide it, or look like one.
+    remark = _level_remark(gaps_v[number:] or gaps_v, float(np.mean(logs[0].voltage_v)))
     return on_model[:number], on_model[number:], model, remark
 
 
-def _level_remark(gap_v: FloatArray, usual_v: float) -> str:
+def _level_remark(gaps_v: Sequence[FloatArray], usual_v: float) -> str:
     """Return that a simulator is off everywhere, which comes before any cause; "" else."""
+    gap_v = np.concatenate(gaps_v)
     mean, varies = float(gap_v.mean()), float(gap_v.std())
     if abs(mean) <= max(LEVEL_PART * usual_v, varies):
         return ""
