@@ -13,7 +13,7 @@ import cangauge
 from cangauge._typing import FloatArray
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
-from cangauge.identify.fit import fit
+from cangauge.identify.fit import common_name, fit
 from cangauge.identify.identification import Identification
 from cangauge.identify.least_squares import (
     ADDED_STD,
@@ -360,6 +360,26 @@ def test_quantized_temperature_is_interpolated(step_k: float) -> None:
     slow_c = 20.0 + 3.0 * np.sin(log.time_s / 1500.0)
     rows = fit_rows(replace(log, temperature_c=np.round(slow_c / step_k) * step_k), CAPACITY_AH)
     assert np.abs(rows.dequantized_c - slow_c[rows.at]).mean() < 0.1 * step_k
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["TripA01", "TripA03", "TripA05", "TripA07", "TripA09"], "TripA (5 logs)"),
+        (["TripA01"], "TripA01"),
+        (["leaf2012_a", "leaf2012_b"], "leaf2012 (2 logs)"),
+        (["drive 9", "drive 10"], "drive (2 logs)"),
+        (["drive1", "drive12"], "drive (2 logs)"),
+        (["cold", "cold"], "cold (2 logs)"),
+        (["cold", "mild", "warm"], "cold and 2 more"),
+        (["2024-01-05", "2024-01-06"], "2024-01 (2 logs)"),
+        (["1", "2"], "1 and 1 more"),
+    ],
+)
+def test_a_model_is_named_after_the_common_part_of_its_logs(
+    names: list[str], expected: str
+) -> None:
+    assert common_name(names) == expected
 
 
 @pytest.mark.real

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, Literal, get_args
@@ -240,10 +241,9 @@ def _fields(
     logs: Sequence[Log], rows: Sequence[FitRows], cells: int | None, options: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the fields of a model file that are known before the fit."""
-    name = logs[0].name
     used = [SourceLog(name=item.name, rows=len(item), sha256=log_sha256(item.log)) for item in rows]
     return {
-        "name": name if len(logs) == 1 else f"{name} and {len(logs) - 1} more",
+        "name": common_name([log.name for log in logs]),
         "chemistry": options["chemistry"],
         "cells": cells,
         "capacity_ah": options["capacity_ah"],
@@ -342,3 +342,18 @@ def log_sha256(
     for name in channels:
         digest.update(np.ascontiguousarray(getattr(log, name)).data)
     return digest.hexdigest()
+
+
+def common_name(names: list[str]) -> str:
+    """Return a name for several logs: what their names begin with, and their number.
+
+    Examples
+    --------
+    >>> common_name(["TripA01", "TripA03", "TripA05"])
+    'TripA (3 logs)'
+    """
+    if len(names) == 1:
+        return names[0]
+    # Less the digits of a number that differs.
+    common = os.path.commonprefix(names).rstrip("0123456789").rstrip(" _-.,(")  # noqa: RUF071
+    return f"{common} ({len(names)} logs)" if common else f"{names[0]} and {len(names) - 1} more"
