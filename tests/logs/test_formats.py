@@ -48,6 +48,15 @@ def test_instrument_is_never_turned_a_can_copy_may_be(tmp_path: Path) -> None:
     assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
 
 
+def test_a_unit_that_is_converted_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    rows = "".join(f"{k},{k % 7},3.8,293.15\n" for k in range(60))
+    path.write_text(f"Test Time / s,Current / A,Voltage / V,Surface Temperature T1 / K\n{rows}")
+    log = read_log(path)
+    assert log.temperature_c[0] == pytest.approx(20.0)
+    assert log.assumed == ('temperature = "Surface Temperature T1 / K" [K]',)
+
+
 def test_rate_in_a_file_name_is_no_set_point(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the file holds no temperature"):
         changed(tmp_path, "bitrode-without-a-header", "No", "No", "2C-Discharge.csv")

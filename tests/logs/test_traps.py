@@ -37,6 +37,17 @@ def rows_of(row: str, rows: int = ROWS) -> list[str]:
 # ---- units
 
 
+@pytest.mark.parametrize("above", [",mA,,", "min,,,°F", "-,-,-,F", "x,mA,y,z", "h,,,"])
+def test_a_preamble_with_a_word_like_a_unit_changes_no_unit(tmp_path: Path, above: str) -> None:
+    """Spreadsheets fill each line of a preamble up to the cells of the header."""
+    for head in (
+        "Time [s],Current [A],Voltage [V],Temp [°C]",
+        "time_s,current_a,voltage_v,temperature_c",
+    ):
+        log = read(tmp_path, f"{above}\n{head}", rows_of("{k},{amps},380,20"))
+        assert (log.time_s[1], log.current_a[1], log.temperature_c[1]) == (1.0, 1.0, 20.0)
+
+
 @pytest.mark.parametrize(("heading", "cell"), [("TimeMS", "{ms}"), ("TimeUS", "{us}")])
 def test_a_time_of_milliseconds_or_microseconds_by_its_name(
     tmp_path: Path, heading: str, cell: str
@@ -628,3 +639,9 @@ def test_infinite_time_is_a_row_without_time(tmp_path: Path) -> None:
     with warnings.catch_warnings(action="error"):
         log = read_log(path)
     assert len(log) == 59
+
+
+def test_a_first_row_with_nothing_but_a_soc_is_not_dropped_in_silence(tmp_path: Path) -> None:
+    head = "time_s,current_a,voltage_v,temperature_c,soc_pct\n,,,,80"
+    log = read(tmp_path, head, rows_of("{k},{amps},380,20,"))
+    assert any(remark.startswith("1 row without time, current") for remark in log.remarks)

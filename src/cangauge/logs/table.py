@@ -141,7 +141,8 @@ def draft_of_table(
             chosen[quantity], unit = _take_time(draft, column, cells, beside)
         else:
             unit = _take(draft, quantity, column, cells, beside)
-        if not is_defined:
+        is_converted = unit_of(FIELDS[quantity], chosen[quantity].unit) not in {None, (1.0, 0.0)}
+        if is_converted or not is_defined:
             draft.assumed.append(_assumption(draft, quantity, column.factor, unit))
     _take_besides(draft, cells, others, may_be_words=besides is None)
     used = {*words, *(place for column in chosen.values() for place in column.places)}

@@ -19,6 +19,7 @@ from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import NEEDED, Choice, choose_columns
 from cangauge.logs.headings import meaning_of
+from cangauge.logs.quantities import FIELDS, unit_of
 from cangauge.logs.stamps import count_stamps
 from cangauge.logs.values import (
     has_spelled_numbers,
@@ -196,11 +197,12 @@ def headed(head: Head, rows: int) -> Iterator[TextTable]:
 def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | None) -> TextTable:
     """Return a table without the rows above its data, with their units.
 
-    Rows below the header that hold no value of time, current and voltage are above the data. One
-    of them, or the row above the header, holds units if it gives a quantity another unit, or shows
-    that it is none (`t`, °C).
+    Rows below the header without a measured value are above the data. One of them holds units if it
+    gives a quantity another unit, or shows that it is none (`t`, °C). So does the row above the
+    header if it holds a unit of every quantity: words of a preamble may look like units.
     """
-    measured = [choice.chosen[name].places[-1] for name in NEEDED]
+    names = choice.chosen if choice.is_canonical else NEEDED  # the unit of a SoC may be 1
+    measured = [choice.chosen[name].places[-1] for name in names]
     lines, first = table.head.lines, table.skip_lines
     above = [line for line in lines[: first - rows] if line.strip()][-1:]
     below = lines[first : first + _ROWS_ABOVE_DATA]
@@ -210,7 +212,7 @@ def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | 
         is_data = _values_in(cells) > 0 or any(map(unit_in_cell, cells[:1]))
         if is_data and number >= first:
             return table._replace(skip_lines=number)
-        if is_data or (number < first and len(row) != len(table.headings)):
+        if is_data or (number < first and not _are_units(row, table.headings, choice)):
             continue
         again = choose_columns(table.headings, row, given)
         if choice.is_canonical and not again.is_canonical:
@@ -220,6 +222,15 @@ def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | 
         if any(units.get(name) != column.unit for name, column in choice.chosen.items()):
             table = table._replace(units=row)
     return table
+
+
+def _are_units(row: Sequence[str], headings: Sequence[str], choice: Choice) -> bool:
+    """Return whether a row holds a unit of every quantity."""
+    return len(row) == len(headings) and all(
+        unit_of(FIELDS[name], row[place].strip("()[]")) is not None
+        for name, column in choice.chosen.items()
+        for place in column.places
+    )
 
 
 def without_header(head: Head) -> TextTable | None:

@@ -112,8 +112,9 @@ class Export:
         wanted = _matching(simple, *patterns, self.sensors, self.ambient, *excludes)
         cells = text.columns(wanted)
         remarks = [f"{self.name} export", *text.remarks]
+        only = _matching(simple, *self.instruments.get("", ()))
         for place, column in cells.items():
-            if column.null_count == len(column):
+            if column.null_count == len(column) and place not in only:
                 remarks.append(f"{header[place]} is empty and was not used")
                 simple[place] = ""
         driving, sensors = self._driving(simple), _matching(simple, self.sensors)
