@@ -176,6 +176,14 @@ def test_refuses_other_files(tmp_path: Path, text: str) -> None:
         Model.load(path)
 
 
+def test_shows_what_a_misspelt_parameter_of_an_effect_is(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    effect = {"id": "current_offset", "parameters": {"ofset_a": 1.0}}
+    path.write_text(json.dumps(json.loads(model.to_json()) | {"effects": [effect]}))
+    with pytest.raises(InputError, match=r"has the fields offset_a only \(got .*ofset_a"):
+        Model.load(path)
+
+
 def test_a_file_of_version_1_is_refused_with_the_cure(model: Model, tmp_path: Path) -> None:
     path = tmp_path / "old.json"
     path.write_text(json.dumps(json.loads(model.to_json()) | {"version": 1}))

@@ -109,8 +109,7 @@ def _shapes_of(item: EffectCandidate, pack: Pack) -> list[Shape]:
     """Return the shapes of an effect with one trial value of each other parameter."""
     effect, found = item.effect, []
     fixed = item.values(np.zeros_like(item.neutral))
-    amplitudes = effect.amplitudes or effect.parameters[:1]
-    sizes = zip(amplitudes, item.bounds.tolist(), item.steps.tolist(), strict=True)
+    sizes = zip(effect.amplitudes, item.bounds.tolist(), item.steps.tolist(), strict=True)
     for amplitude, (low, high), step in sizes:
         usual = amplitude.healthy_std * amplitude.factor(pack) * fixed.get("delayed", 1.0)
         found.append(Shape(effect, amplitude, fixed, low, high, step, usual))

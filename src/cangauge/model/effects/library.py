@@ -78,6 +78,7 @@ def _fields(given: object, names: Sequence[str], owner: str, field: str) -> Mapp
     raise InputError(
         f"{owner} has the fields {', '.join(names)} only",
         field=field,
+        value=given,
         cure="fit again",
     )
 
