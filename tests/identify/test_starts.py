@@ -12,7 +12,7 @@ from test_fit import CELLS
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
-from cangauge.identify.starts import find_starts, start_by_model
+from cangauge.identify.starts import find_starts, given_starts, start_by_model
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
@@ -165,3 +165,12 @@ def test_real_partial_trip_gives_no_capacity(shared_data: Path) -> None:
     for initial in (None, 100.0):
         with pytest.raises(InputError, match="unknown capacity"):
             fit([without_soc(log)], initial_soc_pct=initial)
+
+
+@pytest.mark.parametrize("given", ["auto", ["auto"], [None], None])
+def test_auto_is_a_start_that_is_not_given(given: str | list[str | None] | None) -> None:
+    """As in `estimate`, and as the error for a wrong number of starts says."""
+    assert given_starts(given, 1) == [None]
+    for wrong in ("half", ["half"]):
+        with pytest.raises(InputError, match="not a number"):
+            given_starts(wrong, 1)

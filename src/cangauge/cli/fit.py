@@ -187,7 +187,7 @@ def fit_command(
     from cangauge.identify.fit import fit
     from cangauge.identify.starts import given_starts
 
-    given = [None if each == "auto" else each for each in initial_soc or [None]]
+    given = initial_soc or [None]
     starts = given_starts(given[0] if len(given) == 1 else given, len(logs))
     of_equation = published.given(equation)
     check_outputs([output, report], logs)

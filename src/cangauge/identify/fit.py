@@ -49,7 +49,7 @@ def fit(
     logs: Any,
     *,
     capacity_ah: float | Literal["from-soc"] | None = None,
-    initial_soc_pct: float | Sequence[float | None] | None = None,
+    initial_soc_pct: float | str | Sequence[float | str | None] | None = None,
     equation: Equation = "knots",
     chemistry: ChemistryName | None = None,
     cells: int | None = None,
@@ -69,9 +69,10 @@ def fit(
     capacity_ah : float or "from-soc", optional
         Charge from 100 to 0 % [Ah]; "from-soc": the charge per 100 % of the logs' own SoC; by
         default from a log that runs from full to empty.
-    initial_soc_pct : float, or sequence of float or None, optional
-        SoC at the first row [%], of all logs or of each; by default the log's reference SoC. Where
-        neither is known it is estimated together with the curve, if another log pins it.
+    initial_soc_pct : float or "auto", or a sequence of these, optional
+        SoC at the first row [%], of all logs or of each; by default, and for "auto", the log's
+        reference SoC. Where neither is known it is estimated together with the curve, if another
+        log pins it.
     equation : {"knots", "published"}
         A curve of knots with the chemistry's prior, or the published equation by plain least
         squares.

@@ -11,14 +11,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from scipy import optimize
 
 from cangauge._text import counted, significant
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_number
 from cangauge.identify.least_squares import (
     LogSums,
     N,
@@ -88,19 +88,19 @@ def with_start(log: Log, soc_pct: float) -> Log:
 
 
 def given_starts(
-    initial_soc_pct: float | Sequence[float | None] | None, number: int
+    initial_soc_pct: float | str | Sequence[float | str | None] | None, number: int
 ) -> list[float | None]:
-    """Return the given SoC at the start of each log [%]; None where none is given.
+    """Return the given SoC at the start of each log [%]; None where none is given, or "auto".
 
     Raises
     ------
     InputError
         If several are given, but not one for each log, or one is not within 0–100 %.
     """
-    if initial_soc_pct is None or isinstance(initial_soc_pct, int | float):
-        given: list[float | None] = [initial_soc_pct] * number
-    else:
-        given = list(initial_soc_pct)
+    stated: Any = initial_soc_pct
+    if stated is None or isinstance(stated, int | float | str):
+        stated = [stated] * number
+    given = [None if value == "auto" else value for value in stated]
     if len(given) != number:
         raise InputError(
             f"{len(given)} values for {counted(number, 'log')}",
@@ -108,7 +108,10 @@ def given_starts(
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
     for value in given:
-        if value is not None and not 0.0 <= value <= 100.0:
+        if value is None:
+            continue
+        require_number(value, "--initial-soc")
+        if not 0.0 <= value <= 100.0:
             raise InputError("must lie within 0 … 100 %", field="--initial-soc", value=value)
     return given
 
