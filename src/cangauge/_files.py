@@ -115,10 +115,10 @@ def read_beginning(file: io.BufferedReader, size: int) -> bytes:
 def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the rest of an open file; raise InputError if it has more than `limit` bytes.
 
-    The limit of a bzip2 file is half as large, because it unpacks at most half as fast.
+    The limit of a bzip2 file is a quarter as large, because it unpacks at most a quarter as fast.
     """
     if isinstance(file, bz2.BZ2File):
-        limit //= 2
+        limit //= 4
     if _stated_bytes(file, path) > limit:
         raise _too_large(path, limit, what)
     content = io.BytesIO()  # grows in place: pieces, joined at the end, take the memory twice
