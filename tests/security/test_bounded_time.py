@@ -81,6 +81,7 @@ FILES: dict[str, bytes] = {
     "many commas": (b"," * 60_000 + b"\n") * 20,
     "frames without ends": b"(1.0) can0 123#" + b"00" * (1 << 21),
     "multiplexers": nested_multiplexers(),
+    "a chain of multiplexers": nested_multiplexers(1500),
     "attributes": b'VERSION ""\nBU_: E\n' + b'BA_DEF_ BO_ "A" INT 0 1;\n' * 150_000,
     "a large container": packed_container(1 << 30),
     "blank lines": b"\n" * (1 << 26),

@@ -376,11 +376,13 @@ def load_dbc(path: StringPathLike, remarks: list[str] | None = None) -> Database
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")  # the encoding that most tools write
-    text, changes = prepared(text, path)
     try:
+        text, changes = prepared(text, path)
         if re.search(r"\bBO_\s+\d", text) is None:  # another text takes as long to parse as a DBC
             raise ValueError("it has no message (BO_)")  # noqa: TRY301 - reported as others are
         database = cantools.database.load_string(text, "dbc", strict=False)
+    except InputError:
+        raise
     except Exception as error:  # a damaged DBC may raise anything in cantools
         words = " ".join((str(error) or type(error).__name__).split())[:160]
         problem = f"not a DBC file that can be read: {words}"
