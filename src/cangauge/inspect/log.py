@@ -471,9 +471,11 @@ def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:
         return "no", text
     usable = usable_delays([log], DELAYS_S)
     step = f"rows every {_interval(timing)}"
+    if len(usable) == 1:
+        return "no", f"{step} are too slow for any delay"
     kept = ", ".join(f"{delay:g}" for delay in usable)
     if len(usable) < len(DELAYS_S):
-        return "partly" if len(usable) > 1 else "no", f"{step} identify delays of {kept} s only"
+        return "partly", f"{step} identify delays of {kept} s only"
     # At rows about a second apart, not on a grid: a gap may last months.
     rows = spaced_rows(log.time_s, 1.0)
     rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[1]]

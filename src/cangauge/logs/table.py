@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from typing import Any, Final
@@ -42,7 +42,7 @@ from cangauge.logs.quantities import (
 )
 from cangauge.logs.stamps import changes_of_clock, is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
-from cangauge.logs.values import first_text, is_number, is_text, numbers_of, read_cells
+from cangauge.logs.values import first_text, is_number, numbers_of, read_cells
 
 MAX_COUNTERS: Final = 6
 """Most columns in Ah among which the one that counts the charge is searched [-]."""
@@ -172,8 +172,8 @@ def _take_besides(
 ) -> None:
     """Take columns that are none of the log's."""
     for place, factor in factors.items():
-        if not (may_be_words and is_text(cells[place])):
-            label = draft.headings[place]
+        label = draft.headings[place]
+        with suppress(InputError) if may_be_words else nullcontext():
             numbers, _ = numbers_of(cells[place], draft.where, label)
             draft.values[f"{BESIDES}{label}"] = numbers * factor
 
