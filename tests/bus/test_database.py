@@ -274,7 +274,7 @@ def test_a_multiplexer_that_is_missing_or_its_own_is_refused(tmp_path: Path, lin
 )
 def test_numbers_that_would_take_gigabytes_are_refused_before(tmp_path: Path, line: str) -> None:
     path = tmp_path / "x.dbc"
-    path.write_text(f'VERSION ""\nNS_ :\nBS_:\nBU_: E\n{line}')
+    path.write_text(f'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 256 X: 8 E\n{line}')
     tracemalloc.start()
     with pytest.raises(InputError, match="more than"):
         load_dbc(path)

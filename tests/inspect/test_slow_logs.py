@@ -110,6 +110,13 @@ def test_fit_leaves_out_the_delays_that_inspect_calls_too_short(
     assert text.startswith(f"{sum(len(item.rows) for item in found.fits)} of ")
 
 
+def test_rows_two_minutes_apart_identify_no_delay() -> None:
+    verdict, text = ability(
+        inspect_log(slow_drive(95.0, 1, step_s=120.0, hours=12.0)), "delayed current terms"
+    )
+    assert (verdict, text) == ("no", "rows every 120 s are too slow for any delay")
+
+
 def test_rows_a_minute_apart_count_their_charge() -> None:
     time_s = np.arange(0.0, 36_000.0, 60.01)  # a cycler at C/20
     log = Log(time_s, np.full(time_s.size, 3.0), np.full(time_s.size, 3.7),

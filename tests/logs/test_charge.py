@@ -103,22 +103,23 @@ def test_rows_without_voltage_are_remarked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("headings", "counts"),
+    ("headings", "unit", "counts"),
     [
-        ("Consumed Ah", lambda out, _: [-out]),
-        ("CurrTot [mAh]", lambda out, _: [1000.0 * (7.0 + out)]),
-        ("Charged Ah,Discharged Ah", lambda out, used: [used - out + 100.0, 50.0 + used]),
+        ("Consumed Ah", "", lambda out, _: [-out]),
+        ("Consumed Ah", " Ah", lambda out, _: [-out]),
+        ("CurrTot [mAh]", "", lambda out, _: [1000.0 * (7.0 + out)]),
+        ("Charged Ah,Discharged Ah", "", lambda out, used: [used - out + 100.0, 50.0 + used]),
     ],
 )
 def test_the_capacity_is_that_of_the_logs_own_counter(
-    tmp_path: Path, headings: str, counts: Callable[..., list[np.ndarray]]
+    tmp_path: Path, headings: str, unit: str, counts: Callable[..., list[np.ndarray]]
 ) -> None:
     log = drive()
     assert log.soc_pct is not None
     step_ah = np.diff(log.time_s, prepend=0.0) * log.current_a / 3600.0
     columns = counts(np.cumsum(step_ah), np.cumsum(np.maximum(step_ah, 0.0)))
     table = np.column_stack([log.time_s, log.current_a, log.voltage_v, log.soc_pct, *columns])
-    rows = [",".join(f"{value:.4f}" for value in row) for row in table[::17]]
+    rows = [",".join(f"{value:.4f}" for value in row) + unit for row in table[::17]]
     path = tmp_path / "log.csv"
     path.write_text("\n".join([f"Time [s],Current [A],Voltage [V],SoC [%],{headings}", *rows, ""]))
     read = read_log(path, temperature_c=20.0)

@@ -377,9 +377,9 @@ def load_dbc(path: StringPathLike, remarks: list[str] | None = None) -> Database
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")  # the encoding that most tools write
     try:
-        text, changes = prepared(text, path)
         if re.search(r"\bBO_\s+\d", text) is None:  # another text takes as long to parse as a DBC
             raise ValueError("it has no message (BO_)")  # noqa: TRY301 - reported as others are
+        text, changes = prepared(text, path)
         database = cantools.database.load_string(text, "dbc", strict=False)
     except InputError:
         raise

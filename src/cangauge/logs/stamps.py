@@ -66,7 +66,8 @@ _DIGITS: Final = r"^(19|20)?\d{2}(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([
 
 def count_stamps(cells: Sequence[str]) -> int:
     """Return how many cells hold a date or a clock time."""
-    return int(np.count_nonzero(_match(cells, _DATE_TIME) | _match(cells, _CLOCK_TIME)))
+    alike = _spelled_alike(pa.array(cells, pa.string()))
+    return int(np.count_nonzero(_matches(alike, _DATE_TIME) | _matches(alike, _CLOCK_TIME)))
 
 
 def is_stamp(text: str) -> bool:
@@ -76,7 +77,7 @@ def is_stamp(text: str) -> bool:
 
 def is_clock(text: str) -> bool:
     """Return whether a cell holds a clock time without a date."""
-    return bool(_match([text], _CLOCK_TIME)[0])
+    return bool(_matches(_spelled_alike(pa.array([text])), _CLOCK_TIME)[0])
 
 
 def is_time_format(unit: str) -> bool:
@@ -84,9 +85,8 @@ def is_time_format(unit: str) -> bool:
     return unit.lower() in _ORDERS or _TWO_PARTS.fullmatch(unit) is not None
 
 
-def _match(cells: Sequence[str], pattern: str) -> BoolArray:
-    alike = _spelled_alike(pa.array(cells, pa.string()))
-    return np.asarray(pc.match_substring_regex(alike, pattern), dtype=bool)
+def _matches(cells: Any, pattern: str) -> BoolArray:
+    return np.asarray(pc.match_substring_regex(cells, pattern), dtype=bool)
 
 
 def _spelled_alike(cells: Any) -> Any:

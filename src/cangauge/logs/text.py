@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import product, repeat
 from typing import Any, Final, NamedTuple
 
@@ -163,6 +164,11 @@ def _values_in(cells: Sequence[str]) -> int:
     return len(cells) - len(others) + count_stamps(others)
 
 
+@lru_cache
+def _values_in_line(line: str, delimiter: str) -> int:
+    return _values_in(split_cells(line, delimiter))
+
+
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None."""
     texts = given.texts.values() if given else ()
@@ -255,10 +261,10 @@ def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str]
     """
     found: list[list[str]] = []
     for table in headed(head, rows=1):
-        if _values_in(table.headings) > 1:
+        line, *below = head.lines[table.skip_lines - 1 : table.skip_lines + _ROWS_ABOVE_DATA]
+        if _values_in_line(line, table.delimiter) > 1:
             break
-        below = head.lines[table.skip_lines : table.skip_lines + _ROWS_ABOVE_DATA]
-        if any(_values_in(split_cells(row, table.delimiter)) > 1 for row in below):
+        if any(_values_in_line(row, table.delimiter) > 1 for row in below):
             found.append([*table.headings])
     best = max(found, key=_count_known, default=[])
     return best, choose_columns(best, (), given)
