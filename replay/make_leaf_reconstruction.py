@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from cangauge._files import atomic_path
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
-from cangauge.model.coulomb_counting import discharged_ah
+from cangauge.logs.gaps import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, VOLTAGE_MAE_PCT, leaf_2012_model
 
@@ -235,7 +235,8 @@ def true_voltage(
     model = leaf_2012_model()
     soc = 100.0 * (1.0 - discharged_ah(time_s, current_a) / CAPACITY_AH)
     delayed = delayed_currents(time_s, current_a, model.loads.delays_s, time_s)
-    pack = model.voltage(soc, temperature_c, delayed)
+    load_columns = model.load_columns(temperature_c, delayed)
+    pack = model.pseudo_ocv(soc) + load_columns @ model.load_coefficients
     link = pack.copy()
     edges = np.flatnonzero(np.diff(closed.astype(int))) + 1
     for opened, reclosed in zip(edges[::2], edges[1::2], strict=True):
