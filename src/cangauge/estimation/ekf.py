@@ -17,14 +17,15 @@ c, return to their priors with a time constant τ each, so that no drive teaches
 
 Measurement, the mean voltage of a block of rows with mean load row L, at temperature T:
 
-    U = g(S) + L·θ + row(S, L)·c + A z + √((A·level)² + (δ·g′)² + (ε·g′)² + τ²)·w + v
+    U = g(S) + L·θ + row(S, L)·c + A z + √((A·level)² + (δ·g′)² + (outside·g′)² + unknown²)·w + v
     R = var v = (A·fast)² + (δ·g′)² + var of the load between slow samples,   A = A(T) ≥ 1
 
 g′ is the slope of the curve, δ the uncertainty of the SoC against voltage: one part of it lasts,
-an equal one is new in each block. Outside the temperatures of the fit it lasts with ε more, and
-without a temperature the voltage is uncertain by τ. The sizes are those of the model (`Noise`).
-While the SoC is uncertain by more than `LINEAR_PCT` the update is iterated (iterated extended
-Kalman filter; Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.3).
+an equal one is new in each block. Outside the temperatures of the fit a further uncertainty of the
+SoC lasts (outside), and without a temperature one of the voltage (unknown). The sizes are those of
+the model (`Noise`). While the SoC is uncertain by more than `LINEAR_PCT` the update is iterated
+(iterated extended Kalman filter; Jazwinski, Stochastic Processes and Filtering Theory, 1970,
+ch. 8.3).
 """
 
 from __future__ import annotations
