@@ -12,13 +12,13 @@ from typing import Any, Final
 from cangauge.errors import InputError
 
 _PACKAGES: Final = {
-    "fleet": "distributed",
-    "live": "bokeh",
-    "metrics": "tornado",
-    "mqtt": "paho",
-    "report": "bokeh",
+    "fleet": ("distributed",),
+    "live": ("bokeh", "jinja2", "tornado"),
+    "metrics": ("prometheus_client", "tornado"),
+    "mqtt": ("paho",),
+    "report": ("bokeh", "jinja2"),
 }
-"""A package of each extra that shows whether it is installed."""
+"""The packages that each extra imports."""
 
 
 def extra(place: str) -> Any:
@@ -38,10 +38,10 @@ def require_extra(name: str, field: str | None = None) -> None:
     field : str, optional
         Option or key that needs it.
     """
-    package = _PACKAGES[name]
-    if find_spec(package) is None:
-        raise InputError(
-            f"needs {package}, which is not installed",
-            field=field,
-            cure=f"pip install 'cangauge[{name}]'",
-        )
+    for package in _PACKAGES[name]:
+        if find_spec(package) is None:
+            raise InputError(
+                f"needs {package}, which is not installed",
+                field=field,
+                cure=f"pip install 'cangauge[{name}]'",
+            )

@@ -104,18 +104,6 @@ def test_metrics_are_what_prometheus_reads(http: Served) -> None:
     assert open_metrics[1].endswith(b"# EOF\n")
 
 
-def test_without_prometheus_client(
-    watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "prometheus_client.py").write_text("raise ImportError\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with Served(watched.monitor.latest, http="127.0.0.1:0") as server:
-        assert waits(lambda: get(server.port, "/status")[0] == 200)
-        code, body, _ = get(server.port, "/metrics")
-    assert code == 404
-    assert b"cangauge[metrics]" in body
-
-
 def test_a_token_is_required_where_there_is_one(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,26 +12,18 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Final
 
-from cangauge.errors import InputError
+from prometheus_client import CollectorRegistry, ProcessCollector
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    Metric,
+)
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+
 from cangauge.service.status_client import BOUNDS_S, reason_ids, value_at
 from cangauge.types import Reason, Status
-
-try:
-    from prometheus_client import CollectorRegistry, ProcessCollector
-    from prometheus_client.core import (
-        CounterMetricFamily,
-        GaugeMetricFamily,
-        HistogramMetricFamily,
-        Metric,
-    )
-    from prometheus_client.exposition import choose_encoder
-    from prometheus_client.registry import Collector
-except ImportError as error:
-    raise InputError(
-        "the metrics need the package prometheus-client, which is not installed",
-        field="http",
-        cure="pip install 'cangauge[metrics]'; /status works without",
-    ) from error
 
 _TABLE: Final = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
