@@ -216,7 +216,7 @@ class LogFile:
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
     head, field, value = file.head, None, None
-    foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
+    foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head)
     headings, choice = likely_header(head)
     bare = without_header(head)
     shown = head.first_line.strip()

@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 from typing import Final
 
+from cangauge._files import Head
+
 _READ_PACKED: Final = "; .gz, .bz2 and .zip are read as they are"
 _BY_SAVVYCAN: Final = "open it in SavvyCAN, and save it as a GVRET log"
 _FORMATS: Final = (
@@ -89,11 +91,6 @@ _FORMATS: Final = (
         "InfluxDB's line protocol",
         "export it from InfluxDB as CSV: influx query --raw, or influx -format csv",
     ),
-    (
-        rb"[^\n]*+\n(?: *+[-+\d.eE]++(?=\s|$)){3,} *+\r?(\n|$)",
-        "a table: its columns are separated by blanks",
-        "separate them by commas: sed -E 's/^ +//; s/ +/,/g' FILE > log.csv",
-    ),
     # Captures
     (
         rb" *\([\d.]+\) +\S+ +[0-9A-F]+ +\[\d+\].*::",
@@ -119,18 +116,24 @@ _FORMATS: Final = (
         "what an ELM327 shows, without time stamps",
         "record with a CAN adapter whose program stamps the frames, such as SavvyCAN or candump -l",
     ),
+    (  # last: so do frames in hexadecimal look
+        rb"[^\n]*+\n(?: *+[-+\d.,eE]++(?<!,)(?=\s|$)){3,} *+(\n|$)",
+        "a table: its columns are separated by blanks",
+        "separate them by semicolons: sed -E 's/^ +//; s/ +/;/g' FILE > log.csv",
+    ),
 )
 _FRAME_IDS: Final = {"id", "can id", "arb id", "identifier", "帧id"}
 _FRAME_BYTES: Final = {"d0", "d1", "b1", "data", "data bytes", "dlc", "len", "数据(hex)"}
 
 
-def foreign_format(data: bytes) -> tuple[str, str] | None:
-    """Return what a file is by its first bytes, and the cure; None if it is not known."""
+def foreign_format(head: Head) -> tuple[str, str] | None:
+    """Return what a file is by its beginning, and the cure; None if it is not known."""
+    text = "\n".join(head.lines).encode()  # also of UTF-16
     for pattern, name, cure in _FORMATS:
-        if re.match(pattern, data):
+        if re.match(pattern, head.data) or re.match(pattern, text):
             return name, cure
-    for line in data[:4000].decode(errors="replace").lower().splitlines()[:10]:
-        cells = {cell.strip(' "') for cell in re.split("[,;\t]", line)}
+    for line in head.lines[:10]:
+        cells = {cell.strip(' "') for cell in re.split("[,;\t]", line.lower())}
         if cells & _FRAME_IDS and cells & _FRAME_BYTES:
             return "a table of CAN frames, not of a known form", (
                 f"{_BY_SAVVYCAN}; or write its columns as cabana's CSV: the heading"
