@@ -187,8 +187,11 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     return None
 
 
-def headed(head: Head, rows: int) -> Iterator[TextTable]:
-    """Yield a table below every line or two, if the words of a header are in two rows."""
+def headed(head: Head, rows: int, *, columns: int = 3) -> Iterator[TextTable]:
+    """Yield a table below every line or two, if the words of a header are in two rows.
+
+    `columns` is the least number of them: a log has three.
+    """
     for number, delimiter in product(range(len(head.lines) - rows + 1), _DELIMITERS):
         if delimiter not in head.lines[number]:
             continue
@@ -196,7 +199,7 @@ def headed(head: Head, rows: int) -> Iterator[TextTable]:
         if any(len(row) != len(first) or _values_in(row[1:]) for row in second):
             continue
         headings = [" ".join(cells).strip() for cells in zip(first, *second, strict=True)]
-        if len(headings) > 2:
+        if len(headings) >= columns:
             yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
@@ -260,7 +263,9 @@ def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str]
         If the header has none of a column of the user.
     """
     found: list[list[str]] = []
-    for table in headed(head, rows=1):
+    for table in headed(head, rows=1, columns=2):
+        if len(table.headings) == 2 and _count_known(table.headings) < 2:
+            continue
         line, *below = head.lines[table.skip_lines - 1 : table.skip_lines + _ROWS_ABOVE_DATA]
         if _values_in_line(line, table.delimiter) > 1:
             break
