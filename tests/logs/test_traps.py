@@ -34,6 +34,32 @@ def rows_of(row: str, rows: int = ROWS) -> list[str]:
     return [row.format(k=k, ms=20 * k, us=20_000 * k, amps=k % 7) for k in range(rows)]
 
 
+# ---- rows above the data
+
+
+@pytest.mark.parametrize("words", ["begin of test,,,,", "-,-,-,-,-", "n/a,n/a,n/a,n/a,n/a", "---"])
+@pytest.mark.parametrize(
+    "head", ["time_s,current_a,voltage_v,temperature_c,soc_pct", "Time,Current,Voltage,Temp,SoC"]
+)
+def test_a_row_of_words_below_the_header_is_remarked(tmp_path: Path, head: str, words: str) -> None:
+    log = read(tmp_path, f"{head}\n{words}", rows_of("{k},{amps},380,20,50"))
+    assert len(log) == ROWS
+    assert f"line below the header omitted: {words!r}" in log.remarks
+
+
+def test_rows_of_units_and_of_nothing_are_not_remarked(tmp_path: Path) -> None:
+    head = "Time,Current,Voltage,Temp\ns,mA,,\n,,,"
+    log = read(tmp_path, head, rows_of("{k},{amps},380,20"))
+    assert log.current_a[1] == pytest.approx(1e-3)
+    assert not any("omitted" in remark for remark in log.remarks)
+
+
+def test_named_columns_settle_units_that_contradict_the_headings(tmp_path: Path) -> None:
+    head = "time_s,current_a,voltage_v,temperature_c\ns,mA,V,°C"
+    log = read(tmp_path, head, rows_of("{k},{amps},380,20"), "current=current_a[mA]:1")
+    assert log.current_a[1] == pytest.approx(1e-3)
+
+
 # ---- units
 
 

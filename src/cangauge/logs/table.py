@@ -120,6 +120,10 @@ def draft_of_table(
     choice = choose_columns(headings, table.units, given)
     if choice.is_canonical:
         refuse_odd_names(headings, where)
+    elif given is None and choose_columns(headings).is_canonical:
+        problem, cure = "the row of units contradicts the headings", "correct one of them"
+        shown, cure = ",".join(table.units)[:80], f"{cure}, or name the columns with --columns"
+        raise InputError(problem, source=where, value=shown, cure=cure)
     if not choice.is_complete:
         raise UnknownColumnsError(where, headings, choice, given)
     is_defined = is_defined or choice.is_canonical

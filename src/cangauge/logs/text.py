@@ -208,38 +208,46 @@ def _above_data(table: TextTable, rows: int, choice: Choice, given: ColumnMap | 
 
     Rows below the header without a measured value are above the data. One of them holds units if it
     gives a quantity another unit, or shows that it is none (`t`, °C). So does the row above the
-    header if it holds a unit of every quantity: words of a preamble may look like units.
+    header if it holds a unit of every quantity: words of a preamble may look like units. Rows of
+    other words are left out with a remark.
     """
     names = choice.chosen if choice.is_canonical else NEEDED  # the unit of a SoC may be 1
     measured = [choice.chosen[name].places[-1] for name in names]
     lines, first = table.head.lines, table.skip_lines
     above = [line for line in lines[: first - rows] if line.strip()][-1:]
     below = lines[first : first + _ROWS_ABOVE_DATA]
+    remarks = list[str]()
     for number, line in enumerate([*above, *below], start=first - len(above)):
         row = split_cells(line, table.delimiter)
         cells = [row[k] for k in measured if k < len(row) and row[k]]
         is_data = _values_in(cells) > 0 or any(map(unit_in_cell, cells[:1]))
         if is_data and number >= first:
-            return table._replace(skip_lines=number)
-        if is_data or (number < first and not _are_units(row, table.headings, choice)):
+            return table._replace(skip_lines=number, remarks=remarks)
+        stated = _units_in(row, choice)
+        is_whole = len(row) == len(table.headings) and stated == choice.chosen.keys()
+        if is_data or (number < first and not is_whole):
+            continue
+        if stated <= {"soc"}:  # `-` is a unit of SoC, and a cell without a value
+            if any(row):
+                remarks.append(f"line below the header omitted: {line.strip()[:60]!r}")
             continue
         again = choose_columns(table.headings, row, given)
-        if choice.is_canonical and not again.is_canonical:
-            problem, cure = "the row of units contradicts the headings", "correct one of them"
-            raise InputError(problem, source=table.head.path, value=line.strip()[:80], cure=cure)
         units = {name: column.unit for name, column in again.chosen.items()}
         if any(units.get(name) != column.unit for name, column in choice.chosen.items()):
             table = table._replace(units=row)
     return table
 
 
-def _are_units(row: Sequence[str], headings: Sequence[str], choice: Choice) -> bool:
-    """Return whether a row holds a unit of every quantity."""
-    return len(row) == len(headings) and all(
-        unit_of(FIELDS[name], row[place].strip("()[]")) is not None
+def _units_in(row: Sequence[str], choice: Choice) -> set[str]:
+    """Return the quantities of which a row holds a unit."""
+    return {
+        name
         for name, column in choice.chosen.items()
-        for place in column.places
-    )
+        if all(
+            k < len(row) and unit_of(FIELDS[name], row[k].strip("()[]")) is not None
+            for k in column.places
+        )
+    }
 
 
 def without_header(head: Head) -> TextTable | None:
