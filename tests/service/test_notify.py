@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import signal
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -53,17 +55,32 @@ def systemd(tmp_path: Path) -> Iterator[FakeSystemd]:
 
 
 def test_every_message_also_by_the_abstract_name_space(systemd: FakeSystemd) -> None:
-    notifier = Notifier({"NOTIFY_SOCKET": str(systemd.path)})
-    notifier.send(READY=1, STATUS="on\ncan0")
-    assert systemd.next() == {"READY": "1", "STATUS": "on can0"}
-    for _ in range(10_000):  # a full queue does not block
-        notifier.send(WATCHDOG=1)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as fake:
-        name = f"cangauge-test-{os.getpid()}"
+    with closing(Notifier({"NOTIFY_SOCKET": str(systemd.path)})) as notifier:
+        notifier.send(READY=1, STATUS="on\ncan0")
+        assert systemd.next() == {"READY": "1", "STATUS": "on can0"}
+        for _ in range(10_000):  # a full queue does not block
+            notifier.send(WATCHDOG=1)
+    name = f"cangauge-test-{os.getpid()}"
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as fake,
+        closing(Notifier({"NOTIFY_SOCKET": "@" + name})) as notifier,
+    ):
         fake.bind("\0" + name)
         fake.settimeout(5.0)
-        Notifier({"NOTIFY_SOCKET": "@" + name}).send(WATCHDOG=1)
+        notifier.send(WATCHDOG=1)
         assert fake.recv(100) == b"WATCHDOG=1"
+
+
+def test_the_watchdog_is_reset_without_a_free_file_descriptor(systemd: FakeSystemd) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with closing(Notifier({"NOTIFY_SOCKET": str(systemd.path)})) as notifier:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, limits[1]))
+        try:
+            notifier.send(WATCHDOG=1)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    systemd.socket.settimeout(0.0)
+    assert systemd.next() == {"WATCHDOG": "1"}
 
 
 @pytest.mark.parametrize(
@@ -71,9 +88,9 @@ def test_every_message_also_by_the_abstract_name_space(systemd: FakeSystemd) -> 
     [({}, False), ({"NOTIFY_SOCKET": "vsock:2:1"}, False), ({"NOTIFY_SOCKET": "/x"}, True)],
 )
 def test_what_the_environment_asks_for(environment: dict[str, str], active: bool) -> None:
-    notifier = Notifier(environment)
-    assert notifier.active == active
-    notifier.send(WATCHDOG=1)  # where nobody listens, nothing happens
+    with closing(Notifier(environment)) as notifier:
+        assert notifier.active == active
+        notifier.send(WATCHDOG=1)  # where nobody listens, nothing happens
 
 
 def test_a_service_is_watched_reloaded_and_stopped(

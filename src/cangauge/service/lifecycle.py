@@ -143,13 +143,17 @@ class Notifier:
     """Notify systemd by datagrams of `KEY=value` lines; without effect where it does not listen.
 
     The environment has NOTIFY_SOCKET (a path; a leading "@" denotes the abstract namespace; whether
-    it is there is `active`).
+    it is there is `active`). The socket stays open: a service that is out of file descriptors must
+    still reset the watchdog.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         address = (environment or {}).get("NOTIFY_SOCKET", "")
         self.active = address.startswith(("/", "@")) and hasattr(socket, "AF_UNIX")
         self._address = "\0" + address[1:] if address.startswith("@") else address
+        if self.active:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+            self._socket.setblocking(False)
 
     def send(self, **values: object) -> None:
         """Send values of sd_notify(3), such as READY=1; STATUS is a line for `systemctl status`.
@@ -158,8 +162,10 @@ class Notifier:
         """
         if self.active:
             lines = (f"{key}={printable(' '.join(str(v).split()))}" for key, v in values.items())
-            kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC
-            # Not sent while systemd restarts, or its queue is full.
-            with suppress(OSError), socket.socket(socket.AF_UNIX, kind) as notify:
-                notify.setblocking(False)
-                notify.sendto("\n".join(lines).encode(), self._address)
+            with suppress(OSError):  # systemd restarts, or its queue is full
+                self._socket.sendto("\n".join(lines).encode(), self._address)
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self.active:
+            self._socket.close()

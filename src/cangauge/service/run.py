@@ -155,7 +155,7 @@ class Service:
                 self._outputs.insert(0, self.recorder)
             for output in self._outputs:
                 stack.callback(output.close)
-            notifier = Notifier(os.environ)
+            notifier = stack.enter_context(closing(Notifier(os.environ)))
             monitor = Monitor(
                 pipeline,
                 port,
