@@ -22,6 +22,8 @@ from cangauge.service.loop import Loop
 from cangauge.service.output import Output
 from cangauge.service.own_frames import OwnFrames
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.status import Monitor
+from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import (
     BrokenBus,
@@ -181,6 +183,30 @@ class Failing(Output):
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
         self.calls += 1
         raise RuntimeError("broken")
+
+
+def test_an_output_of_snapshots_costs_no_estimate_for_each_sample() -> None:
+    class Counting(Pipeline):
+        read = 0
+
+        @property
+        def latest(self) -> Estimate:
+            self.read += 1
+            return super().latest
+
+    class Snapshots(Output):
+        taken = 0
+
+        def on_snapshot(self, _snapshot: Snapshot) -> None:
+            self.taken += 1
+
+    port = SimulatedPort(frames_every(0.01, 10.0))
+    pipeline, output = Counting(GENERIC, leaf_model(), GIVEN), Snapshots()
+    monitor = Monitor(pipeline, port, clock=lambda: port.now_s)  # type: ignore[arg-type] # has what is used
+    simulate(port, 10.0, pipeline, outputs=[output], monitor=monitor)
+    assert pipeline.samples > 900
+    assert output.taken >= 40
+    assert pipeline.read < 200
 
 
 def test_a_failing_output_and_an_idle_replay_clock_are_told_once(

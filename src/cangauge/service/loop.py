@@ -78,7 +78,11 @@ class Loop:
 
     def __post_init__(self) -> None:
         port = self.port
-        self._outputs = list(self.outputs)  # those that still take news
+        # The outputs that do something with the news, by the method that takes it.
+        self._takers = {
+            method: [each for each in self.outputs if _overrides(each, method)]
+            for method in ("on_frame", "on_sample", "on_snapshot")
+        }
         self._monitor = self.monitor or Monitor(self.pipeline, port)
         self._published = OwnFrames(echoes=port.address.echoes)
         self._requested = OwnFrames(echoes=port.address.echoes)
@@ -206,7 +210,7 @@ class Loop:
             self._ask(self._poller.take(message, self._now_s))
         if not self.pipeline.handle(message):
             return False
-        if self._outputs or self.pipeline.is_replay:
+        if self._takers["on_sample"] or self.pipeline.is_replay:
             estimate = self.pipeline.latest
             self._give("on_sample", self.pipeline.latest_sample, estimate)
             if frames := self.pipeline.replay_frames(estimate):
@@ -242,17 +246,18 @@ class Loop:
             )
 
     def _give(self, method: str, *news: object) -> None:
-        """Give the outputs some news.
+        """Give some news to the outputs that take it.
 
         One that raises is called no more, and the estimate continues.
         """
-        for output in tuple(self._outputs):
+        for output in self._takers[method]:
             try:
                 getattr(output, method)(*news)
             except Exception as error:  # noqa: BLE001 - whatever it is, the SoC frames continue
                 name = type(output).__name__
                 emit(_LOG.error, "output.failed", f"{name} has ended: {error!r}", limit=name)
-                self._outputs.remove(output)
+                for each, takers in self._takers.items():
+                    self._takers[each] = [taker for taker in takers if taker is not output]
 
     # --- estimates → frames
 
@@ -362,3 +367,8 @@ class Loop:
             self._configure()
         if self._monitor.update(now_s):
             self._give("on_snapshot", self._monitor.latest)
+
+
+def _overrides(output: Output, method: str) -> bool:
+    """Return whether an output does anything with what a method would give it."""
+    return getattr(type(output), method) is not getattr(Output, method)
