@@ -129,17 +129,29 @@ def test_a_recorded_drive_becomes_a_log(tmp_path: Path, generic: Vehicle) -> Non
     assert log.remarks == ()
 
 
-def test_the_replay_clock_gives_the_logs_own_time(tmp_path: Path, generic: Vehicle) -> None:
+def replayed(vehicle: Vehicle, at_s: float) -> list[can.Message]:
+    """Return a drive as replayed ten times faster, with its log's time, from a stamp on [s]."""
     frames = []
-    for frame in drive(generic, start_s=-10.0):
+    for frame in drive(vehicle, start_s=-10.0):
         tick = clock_frame(round(frame.timestamp * 1e6))
-        frame.timestamp = 5000.0 + frame.timestamp / 10.0  # replayed ten times faster
+        frame.timestamp = at_s + frame.timestamp / 10.0
         tick.timestamp, tick.channel = frame.timestamp, "can0"
         frames += [tick, frame]
-    path = record(tmp_path / "replay.log", frames)
+    return frames
+
+
+def test_the_replay_clock_gives_the_logs_own_time(tmp_path: Path, generic: Vehicle) -> None:
+    path = record(tmp_path / "replay.log", replayed(generic, 5000.0))
     log = capture_to_log(path, generic)
     assert log.time_s.tolist() == [round(-10e6 + n * 1e5) / 1e6 for n in range(200)]
-    assert any("REPLAY_CLOCK" in remark for remark in log.remarks)
+    assert log.remarks == ("a recorded replay: time is its log's (REPLAY_CLOCK)",)
+
+
+def test_consecutive_replays_in_a_capture_are_said(tmp_path: Path, generic: Vehicle) -> None:
+    frames = [*replayed(generic, 5000.0), *replayed(generic, 6000.0)]
+    log = capture_to_log(record(tmp_path / "replays.log", frames), generic)
+    assert "2 logs were replayed: cut it into one each" in log.remarks
+    assert "200 samples dropped whose time does not advance" in log.remarks
 
 
 def test_a_cars_own_message_may_have_the_replay_clocks_id(tmp_path: Path, generic: Vehicle) -> None:

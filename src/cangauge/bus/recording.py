@@ -276,6 +276,8 @@ def capture_samples(path: StringPathLike, vehicle: Vehicle) -> CaptureSamples:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if isinstance(bus.time, ReplayClock):
         remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
+    if bus.time.beginnings:
+        remarks.append(f"{bus.time.beginnings + 1} logs were replayed: cut it into one each")
     if bus.sessions:
         remarks.append(f"the stamps start again: {len(bus.sessions) + 1} sessions in one file")
     return CaptureSamples(
