@@ -331,6 +331,8 @@ def test_old_implausible_and_missing_voltages_are_not_used(tmp_path: Path) -> No
         (ARRAY.replace("12", "13"), "CELL_13_V"),
         (ARRAY.replace("{n}", ""), "{n}"),
         (ARRAY.replace("{n}", "{m}"), "{n}"),
+        (ARRAY.replace("{n}", "{n[0]}"), "is not a name with {n}"),
+        (ARRAY.replace("{n}", "{n:>999999}"), "is not a name with {n}"),
         ("[cells]\ncount = 12\n", "either signal"),
         ('[cells]\nindex = "group_number"\ncount = 12\n', "signals and message"),
         (GROUPS.replace("CELL_GROUPS", "NOTHING"), "NOTHING"),

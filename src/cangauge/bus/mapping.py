@@ -5,6 +5,7 @@ A TOML file, for any car with a DBC; `docs/map-file.md` shows each key.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -33,6 +34,8 @@ from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource, VoltageAc
 
 COUNTER: Final = "counter"
 """Protection by a counter alone."""
+_NUMBERED: Final = re.compile(r"[^{}]*(\{n(:0?\d?[dxX]?)?\}[^{}]*)*")
+"""A name with "{n}" or "{n:02d}"; other forms of `str.format` may fail, or take gigabytes."""
 
 
 class SignalMap(SignalChecks):
@@ -110,10 +113,8 @@ class CellsMap(Fields):
         if self.signal is not None and "{n" not in self.signal:
             raise ValueError('signal needs "{n}" for the number of the cell')
         for name in (self.signal, self.message):
-            try:
-                _numbered(name, 1)
-            except (KeyError, IndexError, ValueError, AttributeError) as error:
-                raise ValueError(f"{name!r} is not a name with {{n}}") from error
+            if isinstance(name, str) and _NUMBERED.fullmatch(name) is None:
+                raise ValueError(f"{name!r} is not a name with {{n}}")
         return self
 
     def signal_maps(self) -> list[SignalMap]:
