@@ -97,6 +97,9 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
     ended = replay.end()
     assert ended.code == 130
     assert 0 < ended.json["frames"] < 100
+    # Only the receiver knows what has not arrived.
+    assert ended.json["lost"] is None
+    assert "`cangauge status` counts what was lost" in ended.err
 
 
 BAD_OPTIONS = [

@@ -150,7 +150,9 @@ def _line(state: ReplayState) -> str:
         f"{state.frames} frames, {duration(state.log_seconds)} of log in {state.seconds:.2f} s"
         f" ({number(state.speed, 2)}×)"
     )
-    if state.acknowledged is not None:
+    if state.acknowledged is None:
+        text += "; `cangauge status` counts what was lost"
+    else:
         text += f"; {state.acknowledged} of {state.samples} samples acknowledged"
         text += f", {state.lost} LOST" if state.lost else ""
     if state.soc:
