@@ -9,6 +9,7 @@ import re
 import threading
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from cangauge.replay.player import ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.pipeline import NOTHING_YET, PipelineSettings
 from cangauge.service.record import Recorder
+from cangauge.settings import FrameIds
 from live import (
     PATIENCE_S,
     Service,
@@ -111,6 +113,13 @@ def test_successive_replays_give_equal_estimates() -> None:
     assert (first.acknowledged, second.acknowledged) == (200, 200)
     soc = [estimate.soc_pct for _, estimate in service.rows]
     assert repr(soc[:200]) == repr(soc[200:])  # NaN until the first block
+
+
+def test_the_clock_may_have_another_id() -> None:
+    ids = FrameIds(replay_clock=0x4AF)
+    with virtual_service("moved", replace(REPLAYED, ids=ids)) as service:
+        state = play_log("moved", 10.0, {**MAX, "ids": ids})
+    assert state.acknowledged == state.clock_frames == service.pipeline.samples == 100
 
 
 def test_the_last_samples_are_acknowledged() -> None:
