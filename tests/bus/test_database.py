@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import pickle
 import re
-import time
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -22,6 +21,7 @@ from cangauge.bus.protection import RULES
 from cangauge.bus.publish import reason_bits
 from cangauge.errors import InputError, located
 from cangauge.types import Reason, Status
+from processor import at_most
 
 
 def dbc(signals: str, length: int = 8, more: str = "") -> Message:
@@ -328,13 +328,12 @@ def test_nested_multiplexers_take_bounded_time(tmp_path: Path, pages: int) -> No
         'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 256 M: 64 E\n SG_ S0 M : 0|2@1+ (1,0) [0|0] "" E\n'
         + "".join(signals + lines)
     )
-    began_s = time.process_time()
-    if pages == 2:
-        assert len(load_dbc(path).messages[0].signals) == depth
-    else:
-        with pytest.raises(InputError, match="multiplexers select more than"):
-            load_dbc(path)
-    assert time.process_time() - began_s < 2.0
+    with at_most(2.0):
+        if pages == 2:
+            assert len(load_dbc(path).messages[0].signals) == depth
+        else:
+            with pytest.raises(InputError, match="multiplexers select more than"):
+                load_dbc(path)
 
 
 @pytest.mark.parametrize(
@@ -350,7 +349,5 @@ def test_nested_multiplexers_take_bounded_time(tmp_path: Path, pages: int) -> No
 def test_a_damaged_text_is_refused_in_linear_time(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.dbc"
     path.write_text(f"{PACK}{text}")
-    began_s = time.process_time()
-    with pytest.raises(InputError):
+    with at_most(4.0), pytest.raises(InputError):
         load_dbc(path)
-    assert time.process_time() - began_s < 4.0

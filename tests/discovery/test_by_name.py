@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import can
@@ -11,6 +10,7 @@ import pytest
 
 from cangauge.bus.database import load_dbc
 from cangauge.extras.discovery.by_name import named_signals
+from processor import at_most
 
 # make: signals with their units; the first two are current and voltage of the pack
 PUBLIC = {
@@ -110,7 +110,6 @@ def test_a_long_name_takes_no_longer_than_its_letters(tmp_path: Path) -> None:
         'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 256 M: 8 V\n'
         f' SG_ {name} : 0|16@1+ (1,0) [0|0] "A" V\n'
     )
-    began_s = time.process_time()
-    found = named_signals(load_dbc(tmp_path / "car.dbc"), [])
+    with at_most(1.0):
+        found = named_signals(load_dbc(tmp_path / "car.dbc"), [])
     assert [each.signal for each in found["current"]] == [name]
-    assert time.process_time() - began_s < 1.0

@@ -1,4 +1,4 @@
-"""Every file is read, or refused in one line, within two seconds of processor time."""
+"""Every file is read, or refused in one line, within two seconds of a slow processor."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import bz2
 import gzip
 import os
 import struct
-import time
 import tracemalloc
 import zipfile
 import zlib
@@ -27,6 +26,7 @@ from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 from cangauge.service.state import read_state
 from live import in_process
+from processor import at_most
 
 PARTS, HEADINGS, WITHIN_S = 20_000, 40_000, 2.0
 
@@ -50,9 +50,19 @@ def nested_multiplexers(depth: int = 12) -> bytes:
     return "".join([head, *signals, *values]).encode()
 
 
+def packed_zeros(size: int) -> bytes:
+    """Return so many zeros [whole MB], compressed: one block of a MB, repeated."""
+    packer = zlib.compressobj(9)
+    head = packer.compress(b"") + packer.flush(zlib.Z_FULL_FLUSH)
+    block = packer.compress(bytes(MIB)) + packer.flush(zlib.Z_FULL_FLUSH)
+    end = zlib.compressobj(9, wbits=-15).flush()
+    checksum = (size % 65521) << 16 | 1  # Adler-32
+    return head + size // MIB * block + end + checksum.to_bytes(4, "big")
+
+
 def packed_container(size: int) -> bytes:
     """Return a BLF with one container of zeros."""
-    packed = zlib.compress(bytes(size), 9)
+    packed = packed_zeros(size)
     head = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(packed), 10)
     container = struct.pack("<H6xL4x", 2, size) + packed
     return b"LOGG" + struct.pack("<L", 144) + bytes(136) + head + container
@@ -135,9 +145,8 @@ def test_every_reader_takes_bounded_time(content: str, tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(FILES[content])
     for name, read in READERS.items():
-        began_s = time.process_time()
-        why = refusal(read, path)
-        assert time.process_time() - began_s < WITHIN_S, name
+        with at_most(WITHIN_S, name):
+            why = refusal(read, path)
         assert len(why.splitlines()) <= 1
         assert len(why) < 1000
 
@@ -146,9 +155,8 @@ def test_names_of_a_long_table_take_no_time_for_each_row(tmp_path: Path) -> None
     rows = "2024-03-13 {:02d}:{:02d}:00,c{},1\n"
     lines = [rows.format(k // 60 % 24, k % 60, k % (PARTS // 2)) for k in range(5 * PARTS)]
     (tmp_path / "file").write_text("".join(["time,name,value\n", *lines]))
-    began_s = time.process_time()
-    assert "no plain heading of current and voltage" in refusal(a_log, tmp_path / "file")
-    assert time.process_time() - began_s < WITHIN_S
+    with at_most(WITHIN_S):
+        assert "no plain heading of current and voltage" in refusal(a_log, tmp_path / "file")
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -170,9 +178,8 @@ def test_a_long_name_in_a_zip_costs_no_time(tmp_path: Path) -> None:
     path = tmp_path / "log.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a" + 20_000 * ".gz" + "x", LOG)
-    began_s = time.process_time()
-    assert Head(path).name.endswith(".gzx")
-    assert time.process_time() - began_s < WITHIN_S
+    with at_most(WITHIN_S):
+        assert Head(path).name.endswith(".gzx")
 
 
 def stated_by_gzip(path: Path) -> None:
@@ -213,18 +220,16 @@ def test_a_log_that_states_its_size_is_refused_unread(
     tmp_path: Path, write: Callable[[Path], None]
 ) -> None:
     write(tmp_path / "file")
-    began_s = time.process_time()
-    why = refusal(a_log, tmp_path / "file")
-    assert time.process_time() - began_s < 0.5
+    with at_most(0.5):
+        why = refusal(a_log, tmp_path / "file")
     is_bzip2 = write is stated_by_the_blocks_of_bzip2
     assert f"larger than the {256 if is_bzip2 else 1024} MB that a log may have" in why
 
 
 def test_zeros_in_bzip2_which_states_no_size_are_refused_in_time(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(bz2.compress(LOG) + 70 * bz2.compress(bytes(16 * MIB)))
-    began_s = time.process_time()
-    assert "larger than the 256 MB that a log may have" in refusal(a_log, tmp_path / "file")
-    assert time.process_time() - began_s < WITHIN_S
+    with at_most(WITHIN_S):
+        assert "larger than the 256 MB that a log may have" in refusal(a_log, tmp_path / "file")
 
 
 def test_a_log_that_grows_is_read_as_far_as_it_goes(tmp_path: Path) -> None:

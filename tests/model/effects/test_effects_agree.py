@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
 
 import numpy as np
 import pytest
@@ -27,6 +26,7 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 from cangauge.types import Sample
+from processor import at_most
 from selection import nightly_except
 from synthetic import synthetic_log, voltage_model, within_c
 
@@ -255,7 +255,7 @@ def test_missing_signals_affect_only_themselves(effect: Effect) -> None:
     "effect_id", nightly_except(("core_temperature", "slow_diffusion", "time_skew"), LIBRARY)
 )
 def test_is_fast_enough_for_a_search(effect_id: str) -> None:
-    """90,000 rows (2.5 h at 10 Hz) take about 40 ms; the limit allows for a busy machine."""
+    """90,000 rows (2.5 h at 10 Hz) take about 40 ms."""
     n = 90_000
     time_s = np.arange(n) * 0.1
     signals = Signals(
@@ -263,10 +263,5 @@ def test_is_fast_enough_for_a_search(effect_id: str) -> None:
     )
     effect = LIBRARY[effect_id]
     extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(effect, middle(effect))
-
-    def seconds() -> float:
-        began = time.perf_counter()
+    with at_most(0.5):
         extended.predict(signals, 100.0, np.arange(0, n, 10))
-        return time.perf_counter() - began
-
-    assert any(seconds() < 0.5 for _ in range(5))
