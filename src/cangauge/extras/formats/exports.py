@@ -14,7 +14,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cangauge._files import Head
+from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import NEEDED, shown_headings
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import parse_heading
 from cangauge.logs.quantities import FIELDS
@@ -125,6 +127,12 @@ class Export:
         places |= {name: _matching(simple, *each)[:1] for name, each in self.columns.items()}
         places["temperature"] = sensors or _matching(simple, self.ambient)[:1]
         given = {name: "+".join(f"#{k + 1}" for k in each) for name, each in places.items() if each}
+        missing = [FIELDS[name] for name in NEEDED if name not in given]
+        if missing:
+            found = [text for text, name in zip(header, simple, strict=True) if name]
+            problem = f"no column of this file holds its values (found: {shown_headings(found)})"
+            cure = "check the export, or name the columns with --columns"
+            raise InputError(problem, source=head.path, field=missing[0], cure=cure)
         table = _table(head, header, {k: cells[k] for k in chain(*places.values())})
         draft = draft_of_table(
             table,
