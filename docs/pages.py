@@ -1,9 +1,9 @@
-"""The pages of the site: those of this folder, and those made from the code.
+"""The pages of the site: the pages of this folder, and pages made from the code.
 
     python docs/pages.py out/docs
 
-Commands, frames and effects are made from the code; nothing of them is committed, so that no page
-can differ from it. `make site` calls this, and builds the site from the folder.
+The pages of commands, configuration, frames and effects are made from the code. They are not
+committed, so they cannot differ from it. `make site` calls this program, and builds the site.
 """
 
 from __future__ import annotations
@@ -63,8 +63,9 @@ def commands_page() -> str:
     """Return the reference of the commands, from their help."""
     parts = [
         "# Commands",
-        "Every command has `-h` with the text below, and `--json` for one JSON object on stdout."
-        " Exit codes: 0 done, 1 failed, 2 bad usage or input, 130 stopped by Ctrl-C.",
+        "`cangauge COMMAND -h` prints the text below. With `--json`, every command except `live`"
+        " prints one JSON object on stdout. Exit codes: 0 done, 1 failed, 2 bad usage or input,"
+        " 130 stopped by Ctrl-C.",
     ]
     for name in COMMANDS:
         command = load_command(name)
@@ -81,8 +82,9 @@ def commands_page() -> str:
 def configuration_page() -> str:
     """Return the reference of the service's configuration."""
     text = (
-        "# Configuration of the service\n\nKeys of `cangauge run --config FILE.toml`, and its"
-        " options. Paths are relative to the file. An option takes precedence over its key.\n\n"
+        "# Configuration of the service\n\nThe table lists the keys of `cangauge run --config"
+        " FILE.toml`, and the option that overrides each key. A path in the file is relative to"
+        " the file.\n\n"
     )
     return text + reference()
 
@@ -109,7 +111,11 @@ def _cell(text: str) -> str:
 def frames_page() -> str:
     """Return the reference of the published frames, from their DBC."""
     database = cantools.database.load_file(ROOT / "dbc" / "soc_estimate.dbc")
-    parts = ["# Frames", "Published frames and the replay clock, from `dbc/soc_estimate.dbc`."]
+    parts = [
+        "# Frames",
+        "The service publishes these frames, except the replay clock, which `cangauge replay`"
+        " sends. `dbc/soc_estimate.dbc` defines them.",
+    ]
     parts.append(_comment())
     for message in sorted(database.messages, key=lambda each: each.frame_id):
         period = f", every {message.cycle_time} ms" if message.cycle_time else ""
@@ -126,7 +132,7 @@ def frames_page() -> str:
             cells = (
                 f"`{signal.name}`", f"{signal.start}", f"{signal.length}", f"{signal.scale:g}",
                 limits, signal.unit or "",
-                "Bits, see below." if signal.name == "reason" else str(signal.comment or ""),
+                "See Reasons below." if signal.name == "reason" else str(signal.comment or ""),
             )  # fmt: skip
             rows.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
         parts.append("\n".join(rows))
@@ -135,7 +141,7 @@ def frames_page() -> str:
         f"| {int(reason).bit_length() - 1} | {reason_name(reason)} | {_cell(words)} |"
         for reason, words in REASON_WORDS.items()
     ]
-    parts += ["## Reasons", "A bit is set while its reason applies.", "\n".join(rows)]
+    parts += ["## Reasons", "A bit of `reason` is 1 while its reason applies.", "\n".join(rows)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -147,13 +153,14 @@ def _comment() -> str:
 
 
 def effects_page() -> str:
-    """Return the effects with equation, source, and a drawing of what each does to the voltage."""
+    """Return the effects with equation, source, and a drawing of the voltage that each adds."""
     parts = [
         "# The effects and their signatures",
-        "An effect is a signature at the terminals: what the measured voltage shows beyond the"
-        " model's. Each drawing is half an hour of the same simulated drive: the current above"
-        " (discharge upwards), the voltage that the effect adds below, free of sensor noise."
-        " `cangauge twin --effect ID` simulates it, `cangauge gap` looks for it.",
+        "An effect changes the difference between measured and modelled voltage. The pattern of"
+        " this change is the signature of the effect. Each drawing shows half an hour of the"
+        " same simulated drive. The upper curve is the current (discharge upwards). The lower"
+        " curve is the voltage that the effect adds, without sensor noise. `cangauge twin"
+        " --effect ID` simulates an effect, and `cangauge gap` searches for it.",
     ]
     fault = ""
     for effect in sorted(LIBRARY.values(), key=lambda each: (each.fault, each.id)):
@@ -162,7 +169,6 @@ def effects_page() -> str:
             parts.append(f"## {fault.replace('_', ' ').capitalize()}")
         parts += [
             f"### {effect.id}",
-            inspect.cleandoc(type(effect).__doc__ or ""),
             f"```text\n{effect.equation}\n```",
             inspect.cleandoc(effect.about),
             signature_svg(effect.id),
