@@ -93,7 +93,7 @@ STRICT: Final = ConfigDict(extra="forbid")
 StartPct = Annotated[
     FiniteFloat,
     setting(
-        "SoC at the first sample, or auto: by the first voltages.",
+        "SoC at the first sample. auto: estimated from the first voltages.",
         option="--initial-soc",
         metavar="P|auto",
         unit="%",
@@ -116,14 +116,15 @@ StartStdPct = Annotated[
 ValidStdPct = Annotated[
     FiniteFloat,
     setting(
-        "Standard deviation above which the SoC is published as degraded.",
+        "Standard deviation of the SoC above which the status is degraded.",
         unit="%",
         ge=0.01,
         le=100.0,
     ),
 ]
 CapacityAh = Annotated[
-    FiniteFloat, setting("Capacity.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5)
+    FiniteFloat,
+    setting("Charge from 100 to 0 %.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5),
 ]
 VoltageAccuracyPct = Annotated[
     FiniteFloat,
@@ -136,7 +137,7 @@ VoltageAccuracyPct = Annotated[
 ]
 GapSeconds = Annotated[
     FiniteFloat,
-    setting("Longest step between samples that is not a gap.", unit="s", ge=1e-3, le=3600.0),
+    setting("Longest interval between samples that is not a gap.", unit="s", ge=1e-3, le=3600.0),
 ]
 
 
@@ -152,16 +153,27 @@ class FullCharge:
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
-    voltage_v: Annotated[FiniteFloat, setting("Least voltage.", unit="V", gt=0.0, le=1e4)]
-    current_a: Annotated[
-        FiniteFloat, setting("Largest absolute current.", unit="A", ge=0.0, le=5e3)
+    voltage_v: Annotated[
+        FiniteFloat, setting("Lowest voltage of a full pack.", unit="V", gt=0.0, le=1e4)
     ]
-    hold_s: Annotated[FiniteFloat, setting("Duration of both.", unit="s", ge=0.0, le=86400.0)] = (
-        60.0
-    )
-    soc_pct: Annotated[FiniteFloat, setting("SoC then.", unit="%", ge=0.0, le=100.0)] = 100.0
+    current_a: Annotated[
+        FiniteFloat,
+        setting("Largest absolute current at the end of a full charge.", unit="A", ge=0.0, le=5e3),
+    ]
+    hold_s: Annotated[
+        FiniteFloat,
+        setting(
+            "Time for which voltage and current must fulfil these limits.",
+            unit="s",
+            ge=0.0,
+            le=86400.0,
+        ),
+    ] = 60.0
+    soc_pct: Annotated[
+        FiniteFloat, setting("SoC of the full pack.", unit="%", ge=0.0, le=100.0)
+    ] = 100.0
     soc_std_pct: Annotated[
-        FiniteFloat, setting("Its standard deviation.", unit="%", ge=0.01, le=100.0)
+        FiniteFloat, setting("Standard deviation of this SoC.", unit="%", ge=0.01, le=100.0)
     ] = 0.5
 
     def __post_init__(self) -> None:
@@ -181,11 +193,16 @@ class LongRest:
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
 
     after_s: Annotated[
-        FiniteFloat, setting("Least duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0)
+        FiniteFloat, setting("Shortest duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0)
     ] = 7200.0
     soc_std_pct: Annotated[
         FiniteFloat,
-        setting("Standard deviation of the SoC by its voltage.", unit="%", ge=0.01, le=100.0),
+        setting(
+            "Standard deviation of the SoC that follows from the voltage.",
+            unit="%",
+            ge=0.01,
+            le=100.0,
+        ),
     ] = 2.0
 
     def __post_init__(self) -> None:
@@ -233,7 +250,8 @@ class PackLimits:
     cutoff_soc_pct: Annotated[
         FiniteFloat | None,
         _limit(
-            "SoC at which the energy ends; it also ends at the lowest voltage.",
+            "The energy left is counted down to this SoC, or to the lowest voltage if that comes"
+            " first.",
             "the lower end of the identified SoC",
             "%",
             100.0,

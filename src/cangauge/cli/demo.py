@@ -43,11 +43,11 @@ def demo_command(
 ) -> None:
     """Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.
 
-    The shipped log is a reconstruction of the published 2012 Leaf test, computed from its equation,
-    not a recording of a car. The fit is that of the publication. The played log has another error
-    of the voltage, and a current sensor that reads 1 A too high. The bus is vcan0 if it exists,
-    else UDP multicast on this machine. Takes about a minute. The live page is served
-    meanwhile, at the address printed.
+    The log is not a recording of a car. It is a reconstruction of the published 2012 Leaf test,
+    computed from the published equation, and the model is fitted as in the publication. In the
+    replayed log, the voltage has a different error, and the current sensor reads 1 A too high. The
+    bus is vcan0 if it exists, and otherwise UDP multicast on this machine. The demo takes about a
+    minute. During this time, the live page is served at the printed address.
 
     Examples
     --------

@@ -56,8 +56,8 @@ def estimate_command(
         option(
             "--method",
             "ekf|newton|coulomb",
-            "Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone"
-            " (newton), or counting alone (coulomb).",
+            "Method that computes soc_pct. ekf: Kalman filter with voltage and charge; newton:"
+            " voltage alone; coulomb: counting alone.",
         ),
     ] = "ekf",
     initial_soc: Annotated[
@@ -65,9 +65,9 @@ def estimate_command(
         option(
             "--initial-soc",
             "P|auto",
-            "SoC at the first sample, e.g. 80; `auto` takes it from the first voltages. Default:"
-            " the first soc_pct of a log, counted back to its first row; else, and for a capture"
-            " (as live), auto.",
+            "SoC at the first sample, e.g. 80. `auto` estimates it from the first voltages."
+            " Default for a log: its first soc_pct, counted back to the first row. Default for a"
+            " capture, or without soc_pct: auto.",
             within=(0, 100),
             unit="%",
             word="auto",
@@ -90,7 +90,7 @@ def estimate_command(
         option(
             "--pack",
             "PACK.csv|.parquet",
-            "Table of health, power and cells, once a second.",
+            "Table of health, power and cells, with one row per second.",
             suffixes=(".csv", ".parquet"),
         ),
     ] = None,
@@ -104,10 +104,11 @@ def estimate_command(
     invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
     Positive current discharges.
 
-    PACK has one row per second, of a log over an hour 3,600 rows: capacity_ah, resistance_ratio,
-    offset_a, discharge_a and charge_a (possible for 10 s), energy_wh (left), with standard
-    deviations; energy_to_soc_pct, at which that energy ends; and, where the log has cell voltages
-    (columns cell_1_v, cell_2_v, …, or [cells] of the map file), the weakest cell.
+    PACK has one row per second; for a log over an hour, it has 3,600 rows. Its columns are
+    capacity_ah, resistance_ratio, offset_a, discharge_a and charge_a (possible for 10 s) and
+    energy_wh (left), each with its standard deviation. energy_to_soc_pct is the SoC at which this
+    energy is used up. If the log has cell voltages (columns cell_1_v, cell_2_v, …, or [cells] of
+    the map file), PACK also has the weakest cell.
 
     Examples
     --------

@@ -91,8 +91,8 @@ def fit_command(
         option(
             "--capacity-ah",
             "A|from-soc",
-            "Charge from 100 to 0 %, e.g. 51.5; `from-soc` takes the charge per 100 % of the logs'"
-            " soc_pct. Default: from a log that runs from full to empty.",
+            "Charge from 100 to 0 %, e.g. 51.5, or `from-soc`: counted charge per 100 % of"
+            " soc_pct. Default: found from a log that runs from full to empty.",
             within=(0.001, 1e5),
             unit="Ah",
             word="from-soc",
@@ -103,9 +103,9 @@ def fit_command(
         option(
             "--initial-soc",
             "P|auto",
-            "SoC at the first row; once for all logs, or repeated, once for each in order. Default,"
-            " and auto: its soc_pct; a log without is estimated together with the curve, if another"
-            " log pins it.",
+            "SoC at the first row. Give one value for all logs, or repeat the option for each log"
+            " in order. Default, and `auto`: soc_pct of the log. If a log has no soc_pct, its SoC"
+            " is estimated together with the curve; at least one other log must have a known SoC.",
             within=(0, 100),
             unit="%",
             word="auto",
@@ -116,8 +116,8 @@ def fit_command(
         option(
             "--equation",
             "knots|published",
-            "knots: a curve around the typical cell of the chemistry; published: the published"
-            " equation by plain least squares.",
+            "knots: spline curve with a typical cell of the chemistry as prior. published: the"
+            " published equation, fitted by plain least squares.",
         ),
     ] = "knots",
     chemistry: Annotated[
@@ -125,8 +125,8 @@ def fit_command(
         option(
             "--chemistry",
             "oxide|lfp",
-            "Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate."
-            " Default: from the volts per cell where their number is known, else oxide.",
+            "Chemistry of the cells. oxide: layered oxides or manganese spinel; lfp: iron"
+            " phosphate. Default: from the voltage per cell if --cells is known, otherwise oxide.",
         ),
     ] = None,
     cells: Annotated[
@@ -134,8 +134,9 @@ def fit_command(
         option(
             "--cells",
             "N",
-            "Cells in series: they detect the chemistry and fix the curve beyond the logs. Default:"
-            " the columns of cells of the first log, if it has all.",
+            "Number of cells in series. It determines the chemistry, and the curve beyond the SoC"
+            " of the logs. Default: number of cell-voltage columns in the first log, if it has"
+            " all cells.",
             within=(1, 2000),
         ),
     ] = None,
@@ -144,7 +145,7 @@ def fit_command(
         option(
             "--rate-hz",
             "HZ",
-            "Rate of the fit; faster logs are decimated.",
+            "Sampling rate of the fit. Faster logs are decimated.",
             within=(0.01, 1000),
             unit="Hz",
         ),
@@ -154,8 +155,8 @@ def fit_command(
         option(
             "--effects",
             "ID…|auto|none",
-            "Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those"
-            " that lower the error of left-out logs significantly. Default: none.",
+            "Effects to add to the model, separated by commas, e.g. hysteresis. `auto` adds the"
+            " effects that significantly lower the error of left-out logs. Default: none.",
         ),
     ] = None,
     published: PublishedOptions,
@@ -165,9 +166,9 @@ def fit_command(
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
 
-    A log has time_s [s], current_a [A] (positive discharges), voltage_v [V], temperature_c [°C]
-    and optionally soc_pct [%], or columns of other names (--columns); `cangauge inspect` shows what
-    a file holds. The SoC at the start of at least one log must be known.
+    A log has the columns time_s [s], current_a [A] (positive discharges), voltage_v [V],
+    temperature_c [°C] and optionally soc_pct [%]. Use --columns if they have other names. `cangauge
+    inspect` shows what a file contains. The SoC at the start of at least one log must be known.
 
     Examples
     --------
@@ -182,7 +183,7 @@ def fit_command(
     `cangauge fit known.csv other.csv -o pack.json --capacity-ah 60 --initial-soc 92 --initial-soc
     auto`
 
-    Model file and report are written together, or neither.
+    If the model file or the report cannot be written, neither is written.
     """
     from cangauge.identify.fit import fit
     from cangauge.identify.starts import given_starts

@@ -37,18 +37,20 @@ if TYPE_CHECKING:
 
 @command()
 def gap_command(
-    logs: Annotated[list[Path], argument("LOG", "Logs to diagnose; one fault is sought for all.")],
+    logs: Annotated[
+        list[Path], argument("LOG", "Logs to diagnose. They must have the same fault.")
+    ],
     *,
     model: Annotated[
-        Path | None, option("-m, --model", "MODEL", "Model file; not needed for a simulator.")
+        Path | None, option("-m, --model", "MODEL", "Model file. Not needed with a simulator.")
     ] = None,
     reference: Annotated[
         list[Path] | None,
         option(
             "--reference",
             "LOG",
-            "Log without a fault; repeat the option. Without soc_pct its start is found from the"
-            " voltage.",
+            "Log without a fault. Repeat the option for more logs. If a log has no soc_pct, its"
+            " initial SoC is found from the voltage.",
         ),
     ] = None,
     initial_soc: Annotated[
@@ -56,8 +58,8 @@ def gap_command(
         option(
             "--initial-soc",
             "P",
-            "SoC at the first row of each diagnosed log, e.g. 80. Default: its soc_pct, else found"
-            " from the voltage.",
+            "SoC at the first row of each diagnosed log, e.g. 80. Default: soc_pct of the log;"
+            " without it, found from the voltage.",
             within=(0, 100),
             unit="%",
         ),
@@ -72,8 +74,9 @@ def gap_command(
         option(
             "--simulated",
             "HEADING",
-            "Column of every log with a simulator's voltage for the same current and temperature:"
-            " what it misses is diagnosed, in place of a model's gap.",
+            "Column of every log with the voltage that a simulator computed for the same current"
+            " and temperature. The errors of the simulator are then diagnosed instead of the"
+            " errors of a model.",
         ),
     ] = None,
     simulator: Annotated[
@@ -81,9 +84,9 @@ def gap_command(
         option(
             "--simulator",
             "MODULE:FUNCTION",
-            "The same by a Python function, also FILE.py:FUNCTION, called with time [s], current"
-            " [A, positive = discharge], temperature [°C], SoC of the first row [%]; it returns the"
-            " voltage [V].",
+            "Simulator as a Python function, also FILE.py:FUNCTION. It is called with time [s],"
+            " current [A, positive = discharge], temperature [°C] and SoC of the first row [%],"
+            " and returns the voltage [V].",
         ),
     ] = None,
     alarm: Annotated[
@@ -91,20 +94,27 @@ def gap_command(
         option(
             "--alarm",
             "P",
-            "Report a fault where the probability of none is at most this.",
+            "Report a gap if the probability of no fault is at most P.",
             within=(0, 1),
         ),
     ] = ALARM,
     plan: Annotated[
-        bool, option("--plan", "", "Print what the next measurement is expected to bring.")
+        bool,
+        option(
+            "--plan",
+            "",
+            "Print the next measurement, and how much it is expected to increase the probability"
+            " of the true fault.",
+        ),
     ] = False,
     add_test: Annotated[
         list[Path] | None,
         option(
             "--add-test",
             "LOG",
-            "Log of a further test of the same fault, beside the LOGs of the first diagnosis:"
-            " diagnoses both together and reports what the test changed; repeat the option.",
+            "Log of a further test with the same fault. The test is diagnosed together with the"
+            " LOGs of the first diagnosis, and the changes of the answer are printed. Repeat the"
+            " option for more logs.",
         ),
     ] = None,
     reading: ReadingOptions,
@@ -113,12 +123,13 @@ def gap_command(
 ) -> None:
     """Diagnose the gap between a model and logs: which of nine faults, how large, what to do.
 
-    Three lines answer: the fault, its size and likelihood; the error as it is, with the fault
-    corrected, and of healthy logs; and what to do first. Where the model misses the references
-    themselves, that comes before. A gap is reported where the probability of none is at most
-    --alarm. Give at least three references, better ten; without any, the error stated in the model
-    file counts as normal. A log needs 10 minutes, better an hour, with changing load and SoC; three
-    logs tell much more than one. Positive current discharges.
+    The answer has three lines: the fault with its size and likelihood; the voltage error before and
+    after the correction, and of healthy logs; what to do first. If the model does not describe the
+    references, a line on this comes before. A gap is reported if the probability of no fault is at
+    most --alarm. Give at least three references; ten are better. Without references, the error
+    stated in the model file counts as normal. A log should last at least 10 minutes, better an
+    hour, with changing load and SoC. Three logs give a much clearer answer than one. Positive
+    current discharges.
 
     Examples
     --------

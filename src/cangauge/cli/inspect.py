@@ -45,8 +45,9 @@ def inspect_command(
         Path,
         argument(
             "LOG|CAPTURE",
-            "Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export, or any table"
-            " with a heading for each column; also gzipped or zipped) or CAN capture.",
+            "Log or CAN capture. A log is cangauge's Parquet or CSV, an ANL D3 test, a BMW i3"
+            " trip, a cycler export, or any table with a heading for each column; it may be"
+            " gzipped or zipped.",
         ),
     ],
     *,
@@ -56,10 +57,10 @@ def inspect_command(
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
 
-    Rates, gaps longer than 2 s, ranges, quantization, stuck channels, charge moved [Ah], the
-    capacity that the reference SoC implies [Ah per 100 %], resistance from steps of current [Ω],
-    and what the log can and cannot identify. The sign of current is found from the data. For a
-    capture also frames, CRC and counter errors.
+    The report has rates, gaps longer than 2 s, ranges, quantization, stuck channels, charge moved
+    [Ah], the capacity that the reference SoC implies [Ah per 100 %], and the resistance from steps
+    of current [Ω]. It states what the log can and cannot identify. The sign of the current is
+    found from the data. The report of a capture also has frames, CRC errors and counter errors.
 
     Examples
     --------

@@ -114,17 +114,17 @@ def _number(text: str, field: str, word: str | None, unit: str) -> float:
 
 MODEL: Final = option("-m, --model", "MODEL", "Model file of `cangauge fit`.")
 CHEMISTRY: Final = option(
-    "--chemistry", "oxide|lfp", "Chemistry of the cells, where no model states it."
+    "--chemistry", "oxide|lfp", "Chemistry of the cells. Only without a model."
 )
 CELLS: Final = option(
-    "--cells", "N", "Cells in series, where no model states them.", within=(1, 2000)
+    "--cells", "N", "Number of cells in series. Only without a model.", within=(1, 2000)
 )
 CapacityAh = Annotated[
     float | None,
     option(
         "--capacity-ah",
         "A",
-        "Charge from 100 to 0 %. Default: the model's, where there is one.",
+        "Charge from 100 to 0 %. Default: the capacity of the model, if there is one.",
         within=(1e-3, 1e5),
         unit="Ah",
     ),
@@ -140,7 +140,8 @@ Report = Annotated[
     ),
 ]
 Json = Annotated[
-    bool, option("--json", "", "Print exactly one JSON object on stdout, also for an error.")
+    bool,
+    option("--json", "", "Print exactly one JSON object on stdout, even if the command fails."),
 ]
 
 
@@ -197,19 +198,20 @@ class ReadingOptions:
         option(
             "--vehicle",
             "PRESET",
-            "For a capture: the car's preset (a DBC and a map that ship with cangauge).",
+            "For a capture: preset of the car (DBC and map that ship with cangauge).",
         ),
     ] = None
     dbc: Annotated[
         Path | None,
-        option("--dbc", "FILE", "For a capture: the bus's DBC, where the map names none."),
+        option("--dbc", "FILE", "For a capture: DBC of the bus, if the map does not name one."),
     ] = None
     map_file: Annotated[
         Path | None,
         option(
             "--map",
             "FILE",
-            "For a capture: which signals are current, voltage and temperature, and their DBC.",
+            "For a capture: map file. It names the signals of current, voltage and temperature,"
+            " and their DBC.",
         ),
     ] = None
     columns: Annotated[
@@ -217,10 +219,11 @@ class ReadingOptions:
         option(
             "--columns",
             "NAME=HEADING,…",
-            "For a table of other headings: time, current, voltage, temperature, soc, each"
-            " NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open."
-            " 'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;"
-            " 'temperature=T1+T2' takes the median; '#3' is the third column. See docs/logs.md.",
+            "For a table with other headings: columns of time, current, voltage, temperature and"
+            " soc, each as NAME=HEADING[UNIT]:FACTOR. Unit and factor may be left out if the"
+            " heading states them. Examples: 'current=I_batt[mA]:-1' (in mA, discharge negative);"
+            " 'time=Date+Time' (joins two columns); 'temperature=T1+T2' (median); '#3' (third"
+            " column). See docs/logs.md.",
         ),
     ] = None
     sign: Annotated[
@@ -228,13 +231,13 @@ class ReadingOptions:
         option(
             "--sign",
             "charge|discharge",
-            "What a positive current in the file does. Default: as its format defines it, else"
-            " found from the data.",
+            "Whether positive current in the file charges or discharges the pack. Default:"
+            " defined by the format, or found from the data.",
         ),
     ] = None
     temperature: Annotated[
         float | None,
-        option("--temperature", "C", "Constant temperature [°C], where the input has none."),
+        option("--temperature", "C", "Constant temperature [°C], if the input has none."),
     ] = None
 
     @property

@@ -35,14 +35,17 @@ if TYPE_CHECKING:
     )
 )
 def replay_command(
-    recorded: Annotated[Path, argument("LOG|CAPTURE", "Recorded log, or recorded frames.")],
+    recorded: Annotated[
+        Path, argument("LOG|CAPTURE", "Recorded log, or capture of recorded frames.")
+    ],
     *,
     config: Annotated[
         Path | None,
         option(
             "--config",
             "FILE",
-            "Configuration of the `cangauge run` that listens: its bus, vehicle and ids.",
+            "Configuration of the receiving `cangauge run`. Bus, vehicle and ids are taken from"
+            " it.",
         ),
     ] = None,
     columns: Annotated[
@@ -50,7 +53,7 @@ def replay_command(
         option(
             "--columns",
             "NAME=HEADING,…",
-            "Columns of a table of other headings, as of `cangauge inspect`.",
+            "For a table with other headings: columns, as in `cangauge inspect`.",
         ),
     ] = None,
     speed: Annotated[
@@ -58,8 +61,8 @@ def replay_command(
         option(
             "--speed",
             "1|N|max",
-            "1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges, without"
-            " loss.",
+            "1: real time. N: N times faster. max: as fast as `cangauge run` acknowledges,"
+            " without loss.",
             within=(0.001, 1e6),
             word="max",
         ),
@@ -72,10 +75,10 @@ def replay_command(
 ) -> None:
     """Play a recorded log or capture on a bus.
 
-    A log is sent as the vehicle's frames of current [A], voltage [V], temperature [°C] and SoC [%],
-    a capture as recorded. Recorded timing is kept. At every speed but 1 the log time is sent too
-    (REPLAY_CLOCK, 0x5AF), so that `cangauge run --time-source replay-clock` counts the same charge
-    at any speed.
+    A log is encoded into the vehicle's frames of current [A], voltage [V], temperature [°C] and SoC
+    [%]. A capture is sent as recorded. The recorded timing is kept. At a speed other than 1, the
+    log time is sent as well (REPLAY_CLOCK, 0x5AF). `cangauge run --time-source replay-clock` then
+    counts the same charge at every speed.
 
     Examples
     --------

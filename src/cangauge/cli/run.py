@@ -33,8 +33,8 @@ def run_command(
         option(
             "--config",
             "FILE",
-            "Configuration in TOML; `python -m cangauge.service.config` prints its keys. Options"
-            " given here take precedence.",
+            "Configuration in TOML. `python -m cangauge.service.config` prints its keys. Options"
+            " override the keys.",
         ),
     ] = None,
     json_output: Json = False,
@@ -42,15 +42,15 @@ def run_command(
 ) -> None:
     """Estimate the state of charge from a bus, and publish it there.
 
-    Publishes SOC_ESTIMATE (0x5A0) every 100 ms, and SOC_DETAIL (0x5A1), SOC_HEALTH (0x5A2),
-    SOC_POWER (0x5A3) and, where there are cell voltages, SOC_CELLS (0x5A4) every second, as in
-    `dbc/soc_estimate.dbc`: SoC and its standard deviation [%], status, reasons; capacity [Ah];
-    possible currents [A]; energy left [kWh]. Ctrl-C or SIGTERM stops it with a summary. Positive
-    current discharges.
+    SOC_ESTIMATE (0x5A0) is sent every 100 ms. It has SoC and standard deviation [%], status and
+    reasons. SOC_DETAIL (0x5A1), SOC_HEALTH (0x5A2: capacity [Ah]), SOC_POWER (0x5A3: possible
+    currents [A], energy left [kWh]) and, with cell voltages, SOC_CELLS (0x5A4) are sent every
+    second. `dbc/soc_estimate.dbc` defines the frames. Ctrl-C or SIGTERM stops the service, which
+    then prints a summary. Positive current discharges.
 
-    SIGHUP reloads configuration, model and vehicle: the SoC continues unless current or voltage
-    are decoded otherwise. An invalid configuration is refused (`cangauge check` tests it before).
-    Changes of the bus, the time source and the recording need a restart.
+    SIGHUP reloads configuration, model and map file. The SoC is kept, unless current or voltage is
+    now decoded differently. An invalid configuration is refused (`cangauge check` tests it before).
+    The log names changed keys that need a restart, such as those of bus, time source and recording.
 
     Examples
     --------
@@ -60,8 +60,8 @@ def run_command(
     `cangauge replay trip.parquet --speed max`)
 
     `cangauge run --config car.toml --record drive.log`  (then `cangauge estimate drive.log -m
-    leaf.json --vehicle leaf_aze0 -o soc.parquet` writes the live estimates, bit for bit, unless
-    the configuration changes keys that `estimate` has no option for)
+    leaf.json --vehicle leaf_aze0 -o soc.parquet` writes the live estimates, bit for bit, if the
+    keys that are not options of `estimate` have their defaults)
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
@@ -115,9 +115,9 @@ def check_command(
 ) -> None:
     """Check a configuration as `cangauge run` would read it, without opening the bus.
 
-    Reads model, DBC, map, token and password, and checks ids, bus, addresses and output files.
-    Exit code 2 and one line with file, key, value and cure, if `run` or a reload would refuse it.
-    Whether a port or a bus is free shows when `run` opens it.
+    Model, DBC, map, token and password are read. Ids, bus, addresses and output files are checked.
+    If `run` or a reload would refuse the configuration, the exit code is 2, and one line names
+    file, key, value and cure. Whether a port or bus is free is only known when `run` opens it.
 
     Examples
     --------

@@ -44,15 +44,15 @@ def status_command(
         ),
     ] = None,
     watch: Annotated[
-        bool, option("--watch", "", "Show it again every half second, until Ctrl-C.")
+        bool, option("--watch", "", "Update the output every half second, until Ctrl-C.")
     ] = False,
     json_output: Json = False,
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], inputs, bus.
 
-    Exit code 0: the SoC is valid or degraded. 1: it is invalid or unknown, or no service runs.
-    2: bad usage. With `--json` the object is printed with exit codes 0 and 1. `--watch` may be
-    started before the service, and waits for it.
+    Exit code 0: the SoC is valid or degraded. 1: the SoC is invalid or unknown, or no service runs.
+    2: bad usage. With `--json`, the object is printed for exit codes 0 and 1. `--watch` waits for
+    a service that is not started yet.
 
     Examples
     --------

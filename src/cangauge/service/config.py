@@ -81,8 +81,9 @@ class PollConfig(BaseModel, extra="forbid", frozen=True):
 
     every_s: FiniteFloat = key(
         10.0,
-        "Interval between requests for the same reply. One is sent at a time; without an answer"
-        " the interval doubles, up to a minute; while another tester asks, none is sent.",
+        "Interval between requests for the same reply. One request is sent at a time. Without a"
+        " reply, the interval doubles, up to a minute. No request is sent while another tester is"
+        " active.",
         unit="s",
         ge=1.0,
         le=3600.0,
@@ -97,49 +98,64 @@ class MqttConfig(BaseModel, extra="forbid", frozen=True):
     """MQTT broker that takes the state."""
 
     broker: str = key(..., "Host name or address of the MQTT broker.", min_length=1)
-    port: int | None = key(None, "Its port.", default_text="1883, with TLS 8883", ge=1, le=65535)
-    tls: StrictBool = key(False, "Encrypt, and check its certificate.")
+    port: int | None = key(
+        None, "Port of the broker.", default_text="1883, with TLS 8883", ge=1, le=65535
+    )
+    tls: StrictBool = key(False, "Encrypt the connection, and check the broker's certificate.")
     ca_file: str | None = key(
-        None, "PEM file of the authority that signed it.", default_text="the system's", is_path=True
+        None,
+        "PEM file of the authority that signed the broker's certificate.",
+        default_text="the system's",
+        is_path=True,
     )
     user: str | None = key(None, "User name.")
     password_file: str | None = key(
-        None, "File with the password; or in CANGAUGE_MQTT_PASSWORD.", is_path=True
+        None,
+        "File with the password. Alternative: environment variable CANGAUGE_MQTT_PASSWORD.",
+        is_path=True,
     )
     topic_prefix: str = key(
         "cangauge", "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.", pattern=_TOPIC
     )
     discovery_prefix: str = key(
         "homeassistant",
-        'Home Assistant\'s prefix of discovery; "" without discovery.',
+        'Prefix of the topics for Home Assistant\'s discovery. "" disables discovery.',
         pattern=f"{_TOPIC}|^$",
     )
     device: str | None = key(
         None,
-        "Name of this service among those of the broker.",
+        "Name of this service on the broker.",
         default_text="cangauge_HOST_CHANNEL",
         pattern=r"^[A-Za-z0-9_-]{1,64}$",
     )
-    every_s: FiniteFloat = key(1.0, "Interval of the states.", unit="s", ge=0.1, le=3600.0)
+    every_s: FiniteFloat = key(
+        1.0, "Interval of the published states.", unit="s", ge=0.1, le=3600.0
+    )
 
 
 class JudgeConfig(BaseModel, extra="forbid", frozen=True):
     """A second opinion on the SoC that the battery itself publishes."""
 
-    folder: str = key(..., "Folder for its logs, judgement.json and judgement.html.", is_path=True)
-    keep: int = key(30, "Logs that are kept and judged.", ge=1, le=1000)
+    folder: str = key(
+        ..., "Folder for the judged logs, judgement.json and judgement.html.", is_path=True
+    )
+    keep: int = key(30, "Number of latest logs that are kept and judged.", ge=1, le=1000)
 
 
 class PublishConfig(BaseModel, extra="forbid", frozen=True):
     """A gateway to an inverter, which gets the battery's frames with the estimated SoC."""
 
-    profile: Literal["pylontech", "victron"] = key(..., "Layout of the frame with the SoC.")
+    profile: Literal["pylontech", "victron"] = key(
+        ..., "Protocol of the inverter, which defines the frame with the SoC."
+    )
     interface: str | None = key(
         None, "Driver of the inverter's bus, e.g. socketcan.", default_text="as without `interface`"
     )
-    channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.")
+    channel: str = key(
+        ..., "Channel of the inverter's bus, e.g. can1. It must not be that of the battery."
+    )
     bus_options: dict[str, StrictBool | int | float | str] = key(
-        {}, "Further arguments of its driver."
+        {}, "Further arguments of the driver of the inverter's bus."
     )
 
 
@@ -165,8 +181,9 @@ class RunConfig(BaseModel):
     model: str = key(..., "Model file of `cangauge fit`.", "-m, --model", "MODEL", is_path=True)
     interface: str | None = key(
         None,
-        "python-can interface: socketcan, udp_multicast, pcan, slcan and others. On udp_multicast"
-        " whoever reaches its port may send; only the default bus drops what other machines send.",
+        "python-can interface: socketcan, udp_multicast, pcan, slcan and others. A udp_multicast"
+        " bus accepts packets from every machine that reaches its port; only the default bus"
+        " drops packets from other machines.",
         "--interface",
         "I",
         restart=True,
@@ -189,7 +206,8 @@ class RunConfig(BaseModel):
     )
     wait_for_bus: StrictBool = key(
         False,
-        "Start even if the bus is not available yet. A bus lost later is always reconnected.",
+        "Start even if the bus is not available yet, and wait for it. A bus that is lost later is"
+        " always reconnected.",
         restart=True,
     )
     vehicle: str | None = key(
@@ -201,22 +219,22 @@ class RunConfig(BaseModel):
     )
     dbc: str | None = key(
         None,
-        "DBC file of another vehicle, searched before those that its map names.",
+        "DBC file of another vehicle. It is searched before the DBC files that the map names.",
         "--dbc",
         "FILE",
         is_path=True,
     )
     map: str | None = key(
         None,
-        "TOML file of another vehicle: its DBC, and which signals are current, voltage and"
-        " temperature, with sign and scale.",
+        "Map file of another vehicle (TOML). It names the DBC, and the signals of current,"
+        " voltage and temperature with sign and scale.",
         "--map",
         "FILE",
         is_path=True,
     )
     temperature: FiniteFloat | None = key(
         None,
-        "Constant temperature, instead of the bus's.",
+        "Constant temperature, instead of a temperature from the bus.",
         "--temperature",
         "C",
         unit="°C",
@@ -230,8 +248,8 @@ class RunConfig(BaseModel):
     )
     method: Method = key(
         "ekf",
-        "Published SoC: fusion (ekf), the inverse of the voltage model (newton), or Coulomb"
-        " counting (coulomb).",
+        "Method that computes the published SoC. ekf: Kalman filter with voltage and charge;"
+        " newton: inverse of the voltage model; coulomb: Coulomb counting.",
         "--method",
         "ekf|newton|coulomb",
     )
@@ -242,7 +260,7 @@ class RunConfig(BaseModel):
     max_gap_s: GapSeconds = GAP_S
     pair_within_s: FiniteFloat | None = key(
         None,
-        "Largest time between current and voltage of one sample.",
+        "Largest time between the current and the voltage of one sample.",
         unit="s",
         default_text="0.02",
         ge=0.0,
@@ -250,8 +268,8 @@ class RunConfig(BaseModel):
     )
     time_source: TimeSourceName = key(
         "receive",
-        "Bus time: the receive stamps of the frames, or the log time that `cangauge replay` sends"
-        " at speeds other than 1.",
+        "Source of the bus time. receive: receive timestamps of the frames; replay-clock: log"
+        " time that `cangauge replay` sends at speeds other than 1.",
         "--time-source",
         "receive|replay-clock",
         restart=True,
@@ -262,11 +280,11 @@ class RunConfig(BaseModel):
     ids: FrameIds = key(FrameIds(), "Ids of the published frames.")
     record: str | None = key(
         None,
-        "Record the received frames (candump .log or .log.gz): `cangauge estimate` on them"
-        " gives the live numbers, bit for bit, if the keys that are no option of it have their"
-        " defaults (docs/service.md). A kill loses the last half second. A full disk costs"
-        " frames of the recording, never the estimate. An existing recording is kept: the next run"
-        " is FILE-0001, FILE-0002, …",
+        "Record the received frames (candump .log or .log.gz). `cangauge estimate` on the"
+        " recording gives the live estimates bit for bit, if the keys that are not options of"
+        " `estimate` have their defaults (docs/service.md). A kill loses the last half second. A"
+        " full disk costs frames of the recording, but does not stop the estimate. An existing"
+        " recording is kept: the next run writes FILE-0001, FILE-0002, …",
         "--record",
         "FILE",
         restart=True,
@@ -274,21 +292,25 @@ class RunConfig(BaseModel):
     )
     record_part_mb: Positive | None = key(
         None,
-        "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
+        "Largest size of a file of the recording. The files are named NAME-RUN-PART; commands"
+        " accept NAME-RUN for all parts.",
         unit="MB",
         restart=True,
     )
     record_keep_mb: Positive | None = key(
-        None, "Total size of the recording; the oldest files are removed.", unit="MB", restart=True
+        None,
+        "Largest total size of the recording. Above it, the oldest files are removed.",
+        unit="MB",
+        restart=True,
     )
     duration_s: Positive | None = key(None, "Stop after this time.", unit="s")
     until_idle_s: Positive | None = key(
-        None, "Stop when no sample came for this time, after the first.", unit="s"
+        None, "Stop when no sample has come for this time, after the first sample.", unit="s"
     )
     state: str | None = key(
         None,
-        "Keep SoC, its uncertainty and the delay line over restarts in this file, or in a file in"
-        " this folder.",
+        "Save SoC, its standard deviation and the delay line in this file, or in a file in this"
+        " folder, and continue from them after a restart.",
         "--state",
         "FILE",
         restart=True,
@@ -296,7 +318,7 @@ class RunConfig(BaseModel):
         default_text="systemd's StateDirectory, if there is one",
     )
     state_max_age_s: Positive = key(
-        7.0 * 86400.0, "Age above which the state is refused.", unit="s", restart=True
+        7.0 * 86400.0, "Age above which a saved state is not used.", unit="s", restart=True
     )
     state_every_s: FiniteFloat = key(
         # A service that is killed and restarts within three seconds misses less than half a minute
@@ -325,15 +347,16 @@ class RunConfig(BaseModel):
     )
     http: str | None = key(
         None,
-        "Serve /status, /healthz and /metrics there (extra `metrics`), e.g. 127.0.0.1:9464. An"
-        " address beyond loopback needs a token.",
+        "Address of /status, /healthz and /metrics (extra `metrics`), e.g. 127.0.0.1:9464. An"
+        " address other than loopback needs a token.",
         "--http",
         "HOST:PORT",
         restart=True,
     )
     http_token_file: str | None = key(
         None,
-        "File with the bearer token that requests need; or in CANGAUGE_HTTP_TOKEN.",
+        "File with the bearer token that requests need. Alternative: environment variable"
+        " CANGAUGE_HTTP_TOKEN.",
         restart=True,
         is_path=True,
     )
@@ -343,26 +366,28 @@ class RunConfig(BaseModel):
     dashboard: str | None = key(
         None,
         "Address of the live page (extra `live`). A port alone, such as 8642, serves this machine"
-        " only. One beyond loopback needs a token, as with --http.",
+        " only. An address other than loopback needs a token, as with --http.",
         "--dashboard",
         "HOST:PORT",
         restart=True,
     )
     live: Literal["child", "unit"] = key(
         "child",
-        "What serves `dashboard`, `http` and `mqtt`: a child process of the service, or `cangauge"
-        " live CONFIG` as a unit of its own.",
+        "Process that serves `dashboard`, `http` and `mqtt`. child: child process of the service;"
+        " unit: `cangauge live CONFIG`, started separately.",
         restart=True,
     )
     status_socket: str = key(
         "auto",
-        "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
+        "Unix socket for `cangauge status`. auto: a socket in the user's runtime folder.",
         "--status-socket",
         "PATH|auto|off",
         restart=True,
     )
-    log_format: LogFormat = key("text", "Format of the events on stderr, one a line.", restart=True)
-    log_level: LogLevel = key("info", "Lowest level of the events.", restart=True)
+    log_format: LogFormat = key(
+        "text", "Format of the events on stderr, one event per line.", restart=True
+    )
+    log_level: LogLevel = key("info", "Lowest level of the events that are logged.", restart=True)
     _file: str = PrivateAttr(_NO_FILE)
     _options: frozenset[str] = PrivateAttr(frozenset())
 

@@ -36,12 +36,14 @@ _SCALE_CURES: Final = {
 @command(keys=config_parameters(*_BUS))
 def init_command(
     captures: Annotated[
-        list[Path] | None, argument("[CAPTURE]…", "Captures of one car, of a drive.")
+        list[Path] | None, argument("[CAPTURE]…", "Captures of one car, recorded while driving.")
     ] = None,
     *,
-    output: Annotated[Path, option("-o, --output", "DIR", "Folder for run.toml and the others.")],
+    output: Annotated[
+        Path, option("-o, --output", "DIR", "Folder for run.toml and the other files.")
+    ],
     dbc: Annotated[
-        Path | None, option("--dbc", "FILE", "DBC of the car: signals by name and unit.")
+        Path | None, option("--dbc", "FILE", "DBC of the car. Signals are found by name and unit.")
     ] = None,
     choose: Annotated[
         list[str] | None,
@@ -52,7 +54,7 @@ def init_command(
         option(
             "--nominal-voltage",
             "V",
-            "Voltage of the pack, nominal or as a meter shows it: decides its scale.",
+            "Voltage of the pack, nominal or measured. It decides the scale of the voltage signal.",
             within=(10, 1500),
             unit="V",
         ),
@@ -70,11 +72,11 @@ def init_command(
 ) -> None:
     """Find the car's signals, check them against each other, and write a map and a configuration.
 
-    From captures, or from a live bus that it listens to. Known vehicles are recognised by ids and
-    CRC; with --dbc, signals are found by name and unit; without either, by physics: current and
-    voltage are the pair of fields that follows ΔU = −R·ΔI. Record while driving: a parked car
-    has no current. Where the first of three candidates is not clearly ahead, it exits with 1 and
-    names the three; --choose decides.
+    The frames come from captures or from a live bus. Known vehicles are recognised by ids and CRC.
+    With --dbc, signals are found by name and unit. Otherwise, signals are found by physics: current
+    and voltage are the pair of fields that follows ΔU = −R·ΔI. Record while driving, because a
+    parked car has no current. If the first of three candidates is not clearly the best, `init`
+    names the three, and ends with exit code 1. Then choose one with --choose.
 
     Examples
     --------

@@ -17,7 +17,9 @@ def export_c_command(
     output: Annotated[
         Path,
         option(
-            "-o, --output", "DIR", "Folder for the sources: empty, of an earlier export, or made."
+            "-o, --output",
+            "DIR",
+            "Folder for the sources: a new or empty folder, or that of an earlier export.",
         ),
     ],
     chemistry: Annotated[Literal["oxide", "lfp"], CHEMISTRY] = "oxide",
@@ -28,8 +30,9 @@ def export_c_command(
         option(
             "--platform",
             "generic|esp-idf|zephyr|arduino|foxbms",
-            "What the folder is to be: sources with a Makefile and tests, an ESP-IDF component, a"
-            " Zephyr module, an Arduino library, or the SoC module of foxBMS 2; with an example.",
+            "Form of the folder. generic: sources with a Makefile and tests; esp-idf: component;"
+            " zephyr: module; arduino: library; foxbms: SoC module of foxBMS 2. Each has an"
+            " example.",
         ),
     ] = "generic",
     period: Annotated[
@@ -37,7 +40,8 @@ def export_c_command(
         option(
             "--period",
             "S",
-            "Time between two currents that the delay line keeps: more samples cost no memory.",
+            "Interval of the currents that the delay line stores. Samples in between need no"
+            " memory.",
             within=(0.001, 60),
             unit="s",
         ),
@@ -46,14 +50,15 @@ def export_c_command(
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller.
 
-    Without a model, chemistry, cells and capacity give that of the typical cell.
+    Without a model, give chemistry, cells and capacity: the sources then have the model of a
+    typical cell.
 
     Examples
     --------
     `cangauge export-c -m pack.json -o pack_c`
 
-    `cangauge export-c --chemistry lfp --cells 16 --capacity-ah 280 -o pack_c`  (no log yet: the
-    typical cell, with the uncertainty that belongs to it)
+    `cangauge export-c --chemistry lfp --cells 16 --capacity-ah 280 -o pack_c`  (without
+    logs: typical cell, with its uncertainty)
     """
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.extras.embedded.embedded import export_c, std_at_rest_pct

@@ -21,15 +21,15 @@ def export_fmu_command(
         option(
             "--kind",
             "pack|estimator",
-            "pack: current and temperature in, voltage and SoC out; estimator: voltage too in, SoC,"
-            " σ and status out.",
+            "pack: inputs current and temperature, outputs voltage and SoC. estimator: inputs"
+            " current, temperature and voltage, outputs SoC, σ and status.",
         ),
     ] = "pack",
     json_output: Json = False,
 ) -> None:
     """Write a model as a functional mock-up unit (FMI 2.0, co-simulation).
 
-    The unit is compiled by the C compiler of this machine, and holds its sources for others.
+    The unit is compiled for this machine. Its sources are included, to compile it for others.
 
     Examples
     --------

@@ -56,7 +56,7 @@ _SHOWN_ROWS: Final = 20
 def fleet_command(
     answer: Annotated[
         Literal["estimate", "gap", "judge"],
-        argument("estimate|gap|judge", "Command whose answer a row holds."),
+        argument("estimate|gap|judge", "Command to run on each log."),
     ],
     logs: Annotated[list[Path], argument("LOG", "Logs or captures.")],
     *,
@@ -69,7 +69,8 @@ def fleet_command(
         option(
             "--reference",
             "LOG",
-            "For gap: log without a fault, of any of the vehicles; repeat the option.",
+            "For gap: log without a fault, of any of the vehicles. Repeat the option for more"
+            " logs.",
         ),
     ] = None,
     scheduler: Annotated[
@@ -77,18 +78,18 @@ def fleet_command(
         option(
             "--scheduler",
             "ADDRESS",
-            "Dask scheduler that computes the rows, e.g. tcp://10.0.0.5:8786; for more than a"
-            " thousand logs. Needs the extra `fleet`.",
+            "Dask scheduler, e.g. tcp://10.0.0.5:8786, for more than a thousand logs. Needs the"
+            " extra `fleet`.",
         ),
     ] = None,
     reading: ReadingOptions,
     json_output: Json = False,
 ) -> None:
-    """Estimate, diagnose or judge each of many logs: one row of a Parquet table each.
+    """Estimate, diagnose or judge each of many logs: one Parquet table, with one row per log.
 
-    A row has the numbers of the command's `--json` by their dotted names. A log that fails is a row
-    with its error. One process for each core computes the rows, or the workers of a Dask scheduler,
-    which see the same files.
+    The columns are the numbers of the command's `--json`, with dotted names. If a log fails, its
+    row has the error. The rows are computed by one process per core, or by the workers of a Dask
+    scheduler. The workers must see the same files.
 
     Examples
     --------

@@ -76,11 +76,11 @@ def judge_command(
 ) -> None:
     """Judge the SoC that a battery gauge publishes: is it right, since when not, and why.
 
-    The logs are of one pack, best of several days, with the published SoC as soc_pct. What happened
-    between two logs need not be known. Three lines answer: by how much the gauge is off now, what
-    happened before and why, and what to do next. Where the logs cannot tell, it says so. Positive
-    current discharges. Without a model, give --chemistry and --cells; the capacity is then that of
-    the gauge's own count, unless it is given.
+    Give logs of one pack, best of several days, with the published SoC as soc_pct. Charging and
+    driving between the logs need not be recorded. The answer has three lines: the present error of
+    the gauge; earlier errors and their cause; what to do next. If the logs do not suffice, the
+    answer states this. Positive current discharges. Without a model, give --chemistry and --cells.
+    Without a capacity, it is found from the counted charge per 100 % of published SoC.
 
     FILE has one row per sample: log, time_s [s], published_pct, corrected_pct and
     corrected_std_pct [%].
@@ -91,9 +91,10 @@ def judge_command(
 
     `cangauge judge day*.csv --chemistry lfp --cells 16 --capacity-ah 280 --corrected soc.csv`
 
-    With --suite, twelve simulated drives with twenty faults of the count are played to a gauge, and
-    a score card is printed. The command that starts it follows `--`; {interface}, {channel},
-    {port}, {model}, {capacity_ah} and {soc} in it are replaced for each run.
+    With --suite, twelve simulated drives are played to a gauge program, each with twenty faults of
+    the counted charge. The result is a score card. The command that starts the program follows
+    `--`. In this command, {interface}, {channel}, {port}, {model}, {capacity_ah} and {soc} are
+    replaced for each run.
 
     `cangauge judge --suite -- cangauge run --interface {interface} --channel {channel} --bus-option
     port={port} -m {model} --initial-soc {soc} --time-source replay-clock`

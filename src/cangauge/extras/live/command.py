@@ -13,10 +13,10 @@ def live_command(
 ) -> None:
     """Serve the live page, the status by HTTP and MQTT of a running service.
 
-    Reads `dashboard`, `http`, `http_token_file` and `[mqtt]` of the service's configuration, and
-    finds the service by its bus, or by `status_socket`. With `live = "unit"` there, `cangauge run`
-    leaves them to this program. It ends when the service ends: systemd starts both
-    (contrib/systemd/cangauge-live@.service).
+    The settings are `dashboard`, `http`, `http_token_file` and `[mqtt]` of the service's
+    configuration. The service is found by its bus, or by `status_socket`. Set `live = "unit"` in
+    the configuration: `cangauge run` then does not serve these itself. `cangauge live` ends with
+    the service. systemd can start both (contrib/systemd/cangauge-live@.service).
 
     Examples
     --------

@@ -28,8 +28,9 @@ def gap_check_command(
         list[Path] | None,
         argument(
             "[LOG]…",
-            "Your own logs without a fault, four at least, with --capacity-ah and --cells. Headings"
-            " are plain or named by [columns] of the map file. Default: a simulated pack.",
+            "At least four logs of yours without a fault. Also give --capacity-ah and --cells."
+            " Headings are recognised, or named by [columns] of the map file. Default: a"
+            " simulated pack.",
         ),
     ] = None,
     *,
@@ -37,16 +38,17 @@ def gap_check_command(
     cells: Annotated[int, CELLS] = 96,
     at_most: Annotated[
         int | None,
-        option("--at-most", "N", "Leave out at most this many logs.", within=(1, math.inf)),
+        option("--at-most", "N", "Diagnose at most N of the logs.", within=(1, math.inf)),
     ] = None,
     reading: ReadingOptions,
     json_output: Json = False,
 ) -> None:
-    """Measure what `gap` would find: every effect injected into healthy logs of a pack.
+    """Inject every effect into healthy logs of a pack, and count how often `gap` finds it.
 
-    Each log is left out in turn and diagnosed with the others as references: as it is, and with
-    every effect at one, two and four times the error of left-out references. The table has how
-    often the right one of the nine faults came first, and how often one stated alone was right.
+    Each log is diagnosed in turn, with the other logs as references. It is diagnosed as it is, and
+    with every effect at three sizes: one, two and four times the voltage error of left-out
+    references. The table shows how often the right one of the nine faults ranked first, and how
+    often a fault stated alone was right.
 
     Examples
     --------

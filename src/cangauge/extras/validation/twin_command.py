@@ -23,25 +23,35 @@ def twin_command(
         ),
     ],
     seed: Annotated[
-        int, option("--seed", "N", "Selects the pack. Same seed, same log.", within=(0, math.inf))
+        int,
+        option(
+            "--seed",
+            "N",
+            "Number that selects the pack. The same seed gives the same log.",
+            within=(0, math.inf),
+        ),
     ] = 0,
     effect: Annotated[
         list[str] | None,
         option(
             "--effect",
             "ID[:parameter=value,…]",
-            "Fault of the pack or its sensors; repeat for several. A wrong ID or parameter is"
-            " answered with the known ones. `gap_v=V` in place of a size: the size that opens this"
-            " RMS gap. Default: a gap of 0.3 % of the pack voltage.",
+            "Fault of the pack or its sensors. Repeat the option for several faults. For an"
+            " unknown ID or parameter, the known ones are printed. `gap_v=V` instead of a size"
+            " selects the size that changes the voltage by V (RMS). Default: gap_v of 0.3 % of"
+            " the pack voltage.",
         ),
     ] = None,
     day: Annotated[
-        int, option("--day", "N", "Number of the drive, with its weather.", within=(1, math.inf))
+        int,
+        option(
+            "--day", "N", "Number that selects the drive and the weather.", within=(1, math.inf)
+        ),
     ] = 1,
     hours: Annotated[
         float | None,
         option(
-            "--hours", "H", "Duration. Default: 0.5 to 2.5, drawn.", within=(0.05, 12), unit="h"
+            "--hours", "H", "Duration. Default: random, 0.5 to 2.5.", within=(0.05, 12), unit="h"
         ),
     ] = None,
     discharge: Annotated[
@@ -49,7 +59,7 @@ def twin_command(
         option(
             "--discharge",
             "",
-            "Drive from full to empty within the hours (default 2.5 h): a log for `fit`.",
+            "Drive from full to empty within --hours (default 2.5), as a log for `fit`.",
         ),
     ] = False,
     pack: Annotated[
@@ -57,18 +67,18 @@ def twin_command(
         option(
             "--pack",
             "KIND",
-            "leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.",
+            "Pack: leaf24, leaf40, car60, car60lfp, compact or module12. Default: random.",
         ),
     ] = None,
     json_output: Json = False,
 ) -> None:
-    """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
+    """Simulate a pack, a drive, the weather and the sensors, and write the log.
 
-    The cell model is independent of the voltage model that cangauge identifies: tabulated
-    open-circuit voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread,
-    quantized and jittered sensors. Positive current discharges.
+    The cell model is not the voltage model that cangauge identifies. It has tabulated open-circuit
+    voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread, and quantized and
+    jittered sensors. Positive current discharges.
 
-    Python's `cangauge.simulate` takes the same and more: weather, SoC, speed, the chemistry.
+    `cangauge.simulate` in Python has further arguments: weather, SoC, speed and chemistry.
 
     Examples
     --------
