@@ -108,7 +108,7 @@ def test_checking_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_runs_in_bzip2_count_for_no_more_than_they_are(tmp_path: Path) -> None:
     """A block of bzip2 holds the least where each run has four bytes."""
-    path, content = tmp_path / "log.csv", b"11112222" * _files.MIB
+    path, content = tmp_path / "log.csv", b"11112222" * (_files.MIB // 4)
     path.write_bytes(bz2.compress(content))
     with bz2.open(path) as file:
         assert _files.read_all(file, path, 4 * len(content), "a log") == content

@@ -161,20 +161,18 @@ def test_a_span_is_read_once_however_many_ask_for_it() -> None:
 
 
 def test_a_viewer_that_lacks_few_rows_is_sent_those() -> None:
-    async def lacking(rows: int) -> dict[str, Any]:
+    async def answers(*lacking: int) -> list[dict[str, Any]]:
         page = LivePage(http_address("0", None, {}, "dashboard"))
         span = page.history.spans["10min"]
         for tenth in range(1000):
             span.add(np.full(len(COLUMNS), 100.0 * tenth))
         key = json.loads(page.answer("10min", "", 0)[0])["key"]
-        found: dict[str, Any] = json.loads(page.answer("10min", key, 1000 - rows)[0])
-        return found
+        return [json.loads(page.answer("10min", key, 1000 - rows)[0]) for rows in lacking]
 
-    for rows in (0, 1, 100):
-        answer = asyncio.run(lacking(rows))
+    *some, whole = asyncio.run(answers(0, 1, 100, 900))
+    for rows, answer in zip((0, 1, 100), some, strict=True):
         assert answer["is_known"]
         assert len(answer["columns"]["time_ms"]) == rows
-    whole = asyncio.run(lacking(900))
     assert not whole["is_known"]
     assert len(whole["columns"]["time_ms"]) == whole["added"] == 1000
 

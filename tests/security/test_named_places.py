@@ -8,13 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from live import COMMAND, leaf_model_path
+from live import leaf_model_path
 from synthetic import synthetic_log
 
 WATCH = """
-import atexit, json, os, sys
+import json, os, sys
+from cangauge.__main__ import main
 SEEN, WRITES = [], os.O_WRONLY | os.O_RDWR | os.O_CREAT
 def note(event, args):
     if event == "open" and not isinstance(args[0], int) and args[2] & WRITES:
@@ -23,12 +22,17 @@ def note(event, args):
         SEEN.extend(str(each) for each in args if isinstance(each, str | os.PathLike))
     elif event in ("socket.connect", "socket.sendto", "socket.sendmsg", "subprocess.Popen"):
         SEEN.append(f"{event} {args[1]}")
-def tell():
-    left = list(SEEN)
-    with open(os.environ["SEEN"], "w") as out:
-        json.dump(left, out)
-atexit.register(tell)
 sys.addaudithook(note)
+ended = {}
+for name, arguments in json.loads(sys.argv[1]).items():
+    SEEN.clear()
+    sys.argv = ["cangauge", *arguments]
+    try:
+        main()
+    except SystemExit as end:
+        ended[name] = [end.code or 0, list(SEEN)]
+with open(os.environ["ENDED"], "w") as out:
+    json.dump(ended, out)
 """
 COMMANDS = {
     "inspect": ["inspect", "trip.csv"],
@@ -41,8 +45,8 @@ COMMANDS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_writes_and_sends_only_where_it_is_told_to(name: str, tmp_path: Path) -> None:
+def test_a_command_writes_and_sends_only_where_it_is_told_to(tmp_path: Path) -> None:
+    """All commands run in one process, whose audit hook cannot be removed."""
     home, named = tmp_path / "home", tmp_path / "named"
     home.mkdir()
     named.mkdir()
@@ -55,17 +59,21 @@ def test_a_command_writes_and_sends_only_where_it_is_told_to(name: str, tmp_path
     (named / "run.toml").write_text('duration_s = 0.5\nstatus_socket = "off"\n')
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     environment = {
-        "PATH": os.environ["PATH"], "HOME": str(home), "SEEN": str(tmp_path / "seen"),
+        "PATH": os.environ["PATH"], "HOME": str(home), "ENDED": str(tmp_path / "ended"),
         "TMPDIR": str(home), "PYTHONDONTWRITEBYTECODE": "1",
     }  # fmt: skip
-    ended = subprocess.run(
-        [sys.executable, "-c", WATCH + COMMAND, *COMMANDS[name]],
+    process = subprocess.run(
+        [sys.executable, "-c", WATCH, json.dumps(COMMANDS)],
         cwd=tmp_path, env=environment, capture_output=True, check=False,
     )  # fmt: skip
-    assert ended.returncode == 0, ended.stderr
-    seen = [Path(tmp_path, each) for each in json.loads((tmp_path / "seen").read_text())]
+    assert process.returncode == 0, process.stderr
+    ended = json.loads((tmp_path / "ended").read_text())
+    assert list(ended) == list(COMMANDS)
     allowed = {named, Path(os.devnull), Path("/dev/fd")}  # of an open file
-    assert [each for each in seen if allowed.isdisjoint((each, *each.parents))] == []
+    for name, (code, paths) in ended.items():
+        assert code == 0, (name, process.stderr)
+        seen = [Path(tmp_path, each) for each in paths]
+        assert [each for each in seen if allowed.isdisjoint((each, *each.parents))] == [], name
     assert list(home.rglob("*")) == []
     for path, content in before.items():
         assert path.read_bytes() == content
