@@ -327,6 +327,15 @@ def test_refuses_logs_with_different_temperature_sources() -> None:
         fit([log, other], capacity_ah=CAPACITY_AH)
 
 
+def test_refuses_logs_of_different_packs_by_name() -> None:
+    """Otherwise a model of no pack, or a traceback where no model file can state its errors."""
+    pack, cell = trips(2), trips(3)[2]
+    cell = replace(cell, voltage_v=cell.voltage_v / 96.0)
+    with pytest.raises(InputError, match=r"trip1: voltage_v: not of one pack with trip3") as error:
+        fit([*pack, cell], capacity_ah=CAPACITY_AH)
+    assert error.value.cure
+
+
 def test_left_out_errors_are_missing_where_only_that_log_has_the_soc() -> None:
     long = synthetic_log(hours=1.1, start_pct=95.0, end_pct=10.0, noise_v=0.5, name="long")
     short = [

@@ -35,6 +35,7 @@ from cangauge.model.coulomb_counting import (
 )
 from cangauge.model.curve import KNOTS_PCT
 from cangauge.model.model_file import Made, SourceLog
+from cangauge.model.physics import FULL_TO_EMPTY
 from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
 from cangauge.model.voltage_model import DELAYS_S, Ranges
 
@@ -228,13 +229,23 @@ def _effect_ids(effects: str | Sequence[str] | None, equation: Equation) -> tupl
 
 
 def _check_rows(rows: Sequence[FitRows]) -> None:
-    """Raise InputError if the logs have too few rows for a model."""
+    """Raise InputError if the logs have too few rows for a model, or are of different packs."""
     if (number := sum(map(len, rows))) < LEAST_ROWS:
         raise InputError(
             f"only {number} rows can be used, and a fit needs {LEAST_ROWS}",
             source=rows[0].log.source or rows[0].name,
             cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
             " lists what a log can identify",
+        )
+    by_volts = {float(np.median(item.voltage_v)): item for item in rows}
+    low_v, high_v = min(by_volts), max(by_volts)
+    if high_v > FULL_TO_EMPTY * max(low_v, 0.0):
+        raise InputError(
+            f"not of one pack with {by_volts[low_v].name}, which has about {low_v:.4g} V",
+            source=by_volts[high_v].log.source or by_volts[high_v].name,
+            field="voltage_v",
+            value=high_v,
+            cure="fit the logs of one pack only, and check the unit of the voltage",
         )
 
 

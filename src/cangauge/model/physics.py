@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from cangauge.errors import InputError
 from cangauge.model.curve import HermiteCurve
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST
 from cangauge.model.noise import Noise
 from cangauge.model.voltage_model import VoltageModel
+
+FULL_TO_EMPTY: Final = 3.0
+"""Largest ratio of two voltages of one pack: lithium cells are used between 2.0 and 4.4 V, lead and
+nickel cells over a narrower range."""
 
 
 def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:
@@ -23,9 +29,8 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
     middle_v, loads = model.nominal_v, model.loads
     ends = model.pseudo_ocv([*model.range.soc_pct]).tolist()
     low, high = min(*ends, middle_v), max(*ends, middle_v)
-    # Lithium cells are used between 2.0 and 4.4 V, lead and nickel cells over a narrower range;
-    # vehicles and stores stay below 1.5 kV.
-    if not (low > 0.0 and high <= min(1e4, 3.0 * low)):
+    # Vehicles and stores stay below 1.5 kV.
+    if not (low > 0.0 and high <= min(1e4, FULL_TO_EMPTY * low)):
         raise InputError(
             f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
             field="curve.voltage_v" if has_knots else "published.coefficients",
