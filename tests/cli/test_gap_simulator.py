@@ -80,7 +80,7 @@ def test_a_column_is_diagnosed_as_the_function_that_gave_it(
         (["--simulated", "U modell"], "no column has this heading"),
         (["--simulated", "U model [V]", "--simulator", "a:b"], "two simulators"),
         (["--simulator", "nowhere_at_all:simulate"], "cannot be imported"),
-        (["--simulator", "cell.py:other"], "no function other"),
+        (["--simulator", "cell.py:other"], "--simulator: cell.py has no function other"),
         (["--simulator", "cell.py:broken"], "no such cell"),
         (["--simulator", "cell.py:leaves"], "SystemExit"),
         (["--simulator", "leaves.py:simulate"], "SystemExit"),

@@ -254,17 +254,18 @@ def load_function(text: str) -> Callable[..., Any]:
     try:
         is_file = place.endswith(".py")
         names = run_path(place) if is_file else vars(importlib.import_module(place))
-        if not callable(function := names.get(name)):
-            raise ImportError(f"{place} has no function {name}")  # noqa: TRY004, TRY301 - as below
-    except (Exception, SystemExit) as error:
+        function, problem = names.get(name), f"{place} has no function {name}"
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - it may raise anything
+        function, problem = None, f"cannot be imported: {type(error).__name__}: {error}"
+    finally:
+        sys.path.remove("")
+    if not callable(function):
         raise InputError(
-            f"cannot be imported: {type(error).__name__}: {error}",
+            problem,
             field="--simulator",
             value=text,
             cure="give MODULE:FUNCTION or path/to/file.py:FUNCTION",
-        ) from error
-    finally:
-        sys.path.remove("")
+        )
     return function  # type: ignore[no-any-return]
 
 
