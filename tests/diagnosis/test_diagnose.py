@@ -183,7 +183,10 @@ def test_a_model_with_a_wrong_level_is_told_first(references: list[Log], model: 
     assert "with the model corrected" in found.summary
     assert found.extended_rmse_v < 0.3 * found.baseline_rmse_v
     start = judged(found, initial_soc=1.0)
-    assert start.why_not is None
+    correction = start.to_json()["correction"]
+    assert correction["accepted"]
+    alone = "the model is corrected for the healthy logs alone: a wrong start belongs to these logs"
+    assert correction["why_not"].startswith(alone)
     assert "does not correct the fault of these logs: a wrong start belongs to" in start.summary
 
 

@@ -118,7 +118,7 @@ class Diagnosis:
 
     @cached_property
     def why_not(self) -> str | None:
-        """Why there is no correction to write; None where there is one."""
+        """Why the fault of these logs is not corrected; None where it is."""
         return text.why_not(self)
 
     @property

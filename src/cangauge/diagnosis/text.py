@@ -232,7 +232,7 @@ def _to_do(found: Diagnosis) -> str:
     if found.posterior.level == "none":
         return f"{found.check_first}{_would_have_shown(found)}"
     model = "--extended FILE.json saves the corrected model (in Python: `extended_model.save`)."
-    if found.why_not is not None:
+    if not found.is_written:
         return f"{found.check_first} No correction: {found.why_not}."
     if found.correction_path:
         model = f"Corrected model: {found.correction_path}"
@@ -273,12 +273,11 @@ def check_first(found: Diagnosis) -> str:
 
 
 def why_not(found: Diagnosis) -> str | None:
-    """Return why there is no correction to write; None where there is one."""
-    if found.is_written:
-        return None
-    if not found.posterior.stated:
-        return "no fault is stated"
-    return _refusal(found)
+    """Return why the fault of these logs is not corrected; None where it is."""
+    why = _refusal(found) if found.posterior.stated else "no fault is stated"
+    if why is None or not found.is_written:
+        return why
+    return f"the model is corrected for the healthy logs alone: {why}"
 
 
 def _refusal(found: Diagnosis) -> str | None:
