@@ -21,6 +21,7 @@ import numpy as np
 import typer
 
 from cangauge import simulate
+from cangauge.bus.publish import reason_bits
 from cangauge.cli.app import COMMANDS, load_command
 from cangauge.model.effects.library import LIBRARY
 from cangauge.service.config import reference
@@ -136,12 +137,14 @@ def frames_page() -> str:
             )  # fmt: skip
             rows.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
         parts.append("\n".join(rows))
+    bits = {each: int(reason_bits(each)).bit_length() - 1 for each in REASON_WORDS}
     rows = ["| Bit | Reason | Meaning |", "| --- | --- | --- |"]
     rows += [
-        f"| {int(reason).bit_length() - 1} | {reason_name(reason)} | {_cell(words)} |"
-        for reason, words in REASON_WORDS.items()
+        f"| {bits[reason]} | {reason_name(reason)} | {_cell(REASON_WORDS[reason])} |"
+        for reason in sorted(bits, key=bits.__getitem__)
     ]
-    parts += ["## Reasons", "A bit of `reason` is 1 while its reason applies.", "\n".join(rows)]
+    about = "A bit of `reason` is 1 while one of its reasons applies."
+    parts += ["## Reasons", about, "\n".join(rows)]
     return "\n\n".join(parts) + "\n"
 
 
