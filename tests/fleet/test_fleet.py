@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +35,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def processes() -> Iterator[ProcessPoolExecutor]:
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        yield pool
+
+
+@pytest.fixture
+def shared(processes: ProcessPoolExecutor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let commands share two processes, whose start takes longer than their work."""
+    monkeypatch.setattr(
+        "cangauge.extras.fleet.rows.ProcessPoolExecutor", lambda *_: nullcontext(processes)
+    )
+
+
 def drives(folder: Path) -> list[Path]:
     return sorted(folder.glob("drive*.parquet"))
 
@@ -42,27 +60,30 @@ def table_of(folder: Path, answer: str, logs: list[Path], *more: object) -> dict
     return pq.read_table(output).to_pydict()
 
 
-def test_estimates_are_those_of_each_log_alone(folder: Path) -> None:
-    table = table_of(folder, "estimate", drives(folder))
-    assert table["log"] == [str(path) for path in drives(folder)]
-    for path, error_pct in zip(drives(folder), table["soc_mae_pct"], strict=True):
+@pytest.fixture(scope="module")
+def estimates(folder: Path) -> dict[str, Any]:
+    """The table of the drives, of a broken file and of one that is not there."""
+    logs = [*drives(folder), folder / "broken.parquet", folder / "absent.csv"]
+    return table_of(folder, "estimate", logs)
+
+
+def test_estimates_are_those_of_each_log_alone(folder: Path, estimates: dict[str, Any]) -> None:
+    assert estimates["log"][2:] == [str(path) for path in drives(folder)]
+    for path, error_pct in zip(drives(folder), estimates["soc_mae_pct"][2:], strict=True):
         alone = in_process(
             "estimate", path, "-m", folder / "type.json", "-o", folder / "soc.csv", "--json"
         )
         assert error_pct == alone.json["soc_mae_pct"]
 
 
-def test_a_log_that_fails_is_a_row_with_its_error(folder: Path) -> None:
-    logs = [*drives(folder)[:1], folder / "broken.parquet", folder / "absent.csv"]
-    table = table_of(folder, "estimate", logs)
-    assert [Path(log).name for log in table["log"]] == [
-        "absent.csv", "broken.parquet", "drive0.parquet",
-    ]  # fmt: skip
-    assert "no such file" in table["error"][0]
-    assert "broken.parquet" in table["error"][1]
-    assert table["error"][2] is None
-    assert np.isfinite(table["soc_mae_pct"][2])
-    assert table["soc_mae_pct"][:2] == [None, None]
+def test_a_log_that_fails_is_a_row_with_its_error(estimates: dict[str, Any]) -> None:
+    names = [Path(log).name for log in estimates["log"]]
+    assert names[:3] == ["absent.csv", "broken.parquet", "drive0.parquet"]
+    assert "no such file" in estimates["error"][0]
+    assert "broken.parquet" in estimates["error"][1]
+    assert estimates["error"][2:] == [None] * 4
+    assert np.isfinite(estimates["soc_mae_pct"][2:]).all()
+    assert estimates["soc_mae_pct"][:2] == [None, None]
 
 
 def test_no_answer_at_all_fails(folder: Path) -> None:
@@ -76,6 +97,7 @@ def test_no_answer_at_all_fails(folder: Path) -> None:
     assert output.exists()
 
 
+@pytest.mark.usefixtures("shared")
 def test_gaps_are_those_of_each_log_alone(folder: Path) -> None:
     *references, faulty = drives(folder)
     given = [word for path in references for word in ("--reference", path)]
@@ -85,6 +107,7 @@ def test_gaps_are_those_of_each_log_alone(folder: Path) -> None:
     assert table["gap.baseline_rmse_v"] == [alone["gap"]["baseline_rmse_v"]]
 
 
+@pytest.mark.usefixtures("shared")
 def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
     path = drives(folder)[3]
     table = table_of(folder, "judge", [path])
@@ -92,6 +115,7 @@ def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
     assert table["now.error_pct"] == [alone["now"]["error_pct"]]
 
 
+@pytest.mark.usefixtures("shared")
 def test_a_gauge_that_stands_still_is_judged(folder: Path) -> None:
     drive = cangauge.read_log(drives(folder)[3])
     shown = drive.soc_pct.copy()
@@ -100,6 +124,7 @@ def test_a_gauge_that_stands_still_is_judged(folder: Path) -> None:
     assert table_of(folder, "judge", [folder / "stuck.parquet"])["now.verdict"] == ["off"]
 
 
+@pytest.mark.usefixtures("shared")
 @pytest.mark.parametrize(
     ("answer", "shown"),
     [("estimate", "SoC MAE [%]"), ("gap", "P(none)"), ("judge", "verdict")],
@@ -117,6 +142,7 @@ def test_what_a_command_refuses_is_a_row_with_its_error(
     assert "failed: 1 × current_a: charge and SoC contradict each other" in ended.err
 
 
+@pytest.mark.usefixtures("shared")
 def test_a_dask_scheduler_gives_the_same_rows(folder: Path) -> None:
     distributed = pytest.importorskip("distributed")
     here = table_of(folder, "estimate", drives(folder))
@@ -136,6 +162,7 @@ def test_references_belong_to_gap(folder: Path) -> None:
     refused(ended, "--reference", "judge")
 
 
+@pytest.mark.usefixtures("shared")
 def test_the_printed_table_has_words_and_whole_headings(folder: Path) -> None:
     arguments = ("-m", folder / "type.json", "-o", folder / "shown.parquet", "--reference")
     references = (drives(folder)[0], "--reference", drives(folder)[1])
