@@ -54,14 +54,18 @@ $(VENV)/installed-docs: $(VENV)/installed
 demo: $(VENV)/installed
 	$(BIN)/cangauge demo
 
-# A worker a core; the tests of a file stay together, since they share what is slow to prepare.
+# A worker more than cores, since some tests wait for other programs. The tests of a file stay
+# together: they share what is slow to prepare.
+test: WORKERS = $(shell $(BIN)/python -c 'import os; print(os.cpu_count() + 1)')
 # Matrices are small: where every worker's linear algebra has a thread a core, they wait for each other.
 test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
+# Entry points of Hypothesis import trio, which no test uses.
+test: export HYPOTHESIS_NO_PLUGINS := 1
 # The tests are compiled once, not again in each worker of each run.
 test: export PYTHONDONTWRITEBYTECODE :=
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # On a kernel without CAN a guest is booted. It says how many tests ran, and fails if none did.
 socketcan: $(VENV)/installed-dev
