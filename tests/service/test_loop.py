@@ -59,7 +59,8 @@ def test_publishes_every_100_ms_at_any_input_rate(step_s: float, stamp_rate: flo
     assert len(published) == 10 * seconds + 1
     for number, at_s in enumerate(published):
         assert 0.1 * number - 1e-9 <= at_s <= 0.1 * number + 0.0101
-    details = [f for _, f in port.sent if SocReader().read(f)[0] == "soc_detail"]
+    reader = SocReader()
+    details = [f for _, f in port.sent if reader.read(f)[0] == "soc_detail"]
     assert len(details) == seconds + 1
 
 
@@ -67,7 +68,8 @@ def test_heartbeat_waits_briefly_for_the_next_sample() -> None:
     port = simulate(SimulatedPort(frames_every(0.1, 5.0, 0.004)), 5.0)
     expected = [pytest.approx(0.1 * number + 0.004) for number in range(1, 10)]
     assert [round(at_s, 3) for at_s, _ in port.published[1:10]] == expected
-    read = [SocReader().read(frame) for _, frame in port.sent]
+    reader = SocReader()
+    read = [reader.read(frame) for _, frame in port.sent]
     assert [each["samples"] for name, each in read if name == "soc_detail"][:5] == [
         1,
         11,

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import cache
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import can
 from can.typechecking import CanFilter
-from cantools.database.can import Message
+from cantools.database.can import Database, Message
 
 from cangauge._resources import shared_file
 from cangauge._text import plain
@@ -131,8 +132,13 @@ class _Layout:
         return values | {name: _KINDS[name](int(values[name])) for name in _KINDS.keys() & values}
 
 
+@cache
+def _database() -> Database:
+    return load_dbc(shared_file("dbc", "soc_estimate.dbc"))
+
+
 def _layouts(ids: FrameIds) -> dict[str, _Layout]:
-    message = load_dbc(shared_file("dbc", "soc_estimate.dbc")).get_message_by_name
+    message = _database().get_message_by_name
     return {name: _Layout(message(name.upper())) for name in ids.published.values()}
 
 
