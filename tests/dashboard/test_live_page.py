@@ -16,7 +16,7 @@ from headless import MARKS, chromium, faults, set_scheme
 from cangauge._resources import shared_file
 from cangauge.types import Sample
 from live import virtual_port, waits
-from running import RunningService, free_port
+from running import SAMPLE_S, RunningService, free_port
 from selection import nightly_except
 
 pytestmark = MARKS
@@ -119,12 +119,14 @@ def messages(browser: Any, method: str) -> list[dict[str, Any]]:
     return [each["params"] for each in found if each["method"] == method]
 
 
-def test_the_values_come_ten_times_a_second(page: Any) -> None:
+def test_the_values_come_ten_times_a_second(bench: Bench, page: Any) -> None:
     messages(page, "")
-    began = time.monotonic()
+    began = bench.running.service.pipeline.samples
     time.sleep(1.0)
     came = len(messages(page, "Network.webSocketFrameReceived"))
-    assert came / (time.monotonic() - began) > 5.0
+    # Of the car, whose samples come later where the machine is busy.
+    seconds = SAMPLE_S * (bench.running.service.pipeline.samples - began)
+    assert came / seconds > 5.0
 
 
 def test_a_silent_bus_is_shown_within_a_second(bench: Bench, page: Any) -> None:
