@@ -27,6 +27,7 @@ from cangauge.model.effects.base import (
     Pack,
     Signals,
     Values,
+    same_signals,
 )
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
@@ -284,7 +285,7 @@ class OnlineModel:
 
     def correct(self, sample: Sample) -> Sequence[Sample]:
         """Return the corrected samples that are ready, usually one, in order."""
-        if not self.extended.effects:
+        if all(effect.correct is same_signals for effect, _ in self.extended.effects):
             return (sample,)
         signals = Signals(*(np.array([value]) for value in sample))
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):

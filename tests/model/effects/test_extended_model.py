@@ -16,6 +16,8 @@ from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY
+from cangauge.model.effects.signals import COUNTS
+from cangauge.model.effects.voltages import VOLTAGES
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
@@ -90,6 +92,13 @@ def test_an_offset_is_corrected_before_a_gain() -> None:
     )
     found = extended.predict(signals, 80.0, np.arange(50)).signals.current_a
     np.testing.assert_allclose(found, (signals.current_a - 2.0) / 1.05, rtol=1e-12)
+
+
+def test_a_sample_that_no_effect_corrects_is_passed_on() -> None:
+    """Without arrays of one row, which take a tenth of a step."""
+    effects = tuple((effect, middle(effect)) for effect in (*COUNTS, *VOLTAGES))
+    sample = Sample(0.0, 10.0, 370.0, 20.0)
+    assert online_of(ExtendedModel(MODEL, CAPACITY_AH, effects)).correct(sample)[0] is sample
 
 
 @given(st.sets(st.sampled_from(sorted(LIBRARY)), min_size=2, max_size=6), st.integers(0, 99))
