@@ -50,3 +50,11 @@ def test_an_id_that_is_none_of_its_kind_is_refused(
     with pytest.raises(InputError, match=problem) as caught:
         load(tmp_path, number, kind)
     assert caught.value.field == f"messages.Reply.{kind}"
+
+
+def test_a_reply_that_no_request_has_is_not_asked_for(tmp_path: Path) -> None:
+    number = 1 << 31 | 0x7BB2104  # 21 04 is the request
+    assert load(tmp_path, number, "isotp").poll_targets == []
+    with pytest.raises(InputError, match="begins with 21 answers no request") as caught:
+        load(tmp_path, number, "request_id = 0x79B\nisotp")
+    assert caught.value.field == "messages.Reply.request_id"

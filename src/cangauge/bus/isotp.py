@@ -15,6 +15,8 @@ LONGEST_GAP_S: Final = 1.0
 
 SINGLE, FIRST, CONSECUTIVE = range(3)
 """Kinds of frames, in the upper half of their first byte."""
+REPLY_BIT: Final = 0x40
+"""Added to the first byte of a request in the reply to it."""
 READ_BY_IDENTIFIER: Final = 0x62
 """First byte of a reply to ReadDataByIdentifier (22), before two bytes of the data identifier."""
 
@@ -91,4 +93,4 @@ class PollTarget:
     @property
     def request(self) -> bytes:
         """Payload of the request."""
-        return bytes([self.reply[0] - 0x40]) + self.reply[1:]
+        return bytes([self.reply[0] - REPLY_BIT]) + self.reply[1:]

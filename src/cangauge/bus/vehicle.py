@@ -26,7 +26,13 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
-from cangauge.bus.isotp import READ_BY_IDENTIFIER, PollTarget, reply_id, reply_start
+from cangauge.bus.isotp import (
+    READ_BY_IDENTIFIER,
+    REPLY_BIT,
+    PollTarget,
+    reply_id,
+    reply_start,
+)
 from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
@@ -375,15 +381,21 @@ class _Binder:
         Raises InputError if the message's id cannot be what the map says of it.
         """
         number, problem, cure = message.frame_id, "", ""
+        begins_with = number >> 8 & 0xFF
+        is_plain = stated.isotp and not stated.uds
         field = next((kind for kind in _EXTENDED_KINDS if getattr(stated, kind)), "")
         if field and not message.is_extended_frame:
             problem = f"{field} needs an extended id"
             cure = f"give it that number in the DBC, as {_EXTENDED_KINDS[field]}"
-        elif stated.isotp and not stated.uds and number >> 8 & 0xFF == READ_BY_IDENTIFIER:
+        elif is_plain and begins_with == READ_BY_IDENTIFIER:
             field, sender = "isotp", f"0x{reply_id(number):X}"
             problem = "replies that begin with 62 differ in two further bytes"
             cure = f"state uds = true, and number it {sender} and both bytes: {sender}0101 for"
             cure += " 62 01 01"
+        elif is_plain and begins_with < REPLY_BIT and stated.request_id is not None:
+            field = "request_id"
+            problem = f"a reply that begins with {begins_with:02X} answers no request"
+            cure = f"number it in the DBC by a reply to one, as {_EXTENDED_KINDS['isotp']}"
         if problem:
             raise InputError(problem, field=field, value=f"0x{number:X}", cure=cure)
         return reply_start(number, stated.uds) if stated.isotp or stated.uds else b""
