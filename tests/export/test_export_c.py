@@ -73,9 +73,12 @@ def run(folder: Path, *command: str) -> str:
 
 
 @needs_make
-@pytest.mark.parametrize("which", ["knots", "effects"])
-def test_exported_tests_pass(folders: dict[str, Path], which: str) -> None:
-    output = run(folders[which], "make", "test")
+@pytest.mark.parametrize(
+    ("which", "flags"),
+    [("knots", []), ("effects", [f"FLAGS={' '.join(STRICT)} -O0 -DCANGAUGE_CONFIG"])],
+)
+def test_exported_tests_pass(folders: dict[str, Path], which: str, flags: list[str]) -> None:
+    output = run(folders[which], "make", "test", *flags)
     doubles, _, floats = output.partition("./test-float")
     assert doubles.count("PASSED") == floats.count("PASSED") == 1
 

@@ -597,7 +597,7 @@ def cpu_s(days: int) -> float:
 
 def test_time_grows_with_the_number_of_logs() -> None:
     cpu_s(2)  # what is loaded once
-    assert cpu_s(80) < 3.0 * cpu_s(40)
+    assert cpu_s(40) < 3.0 * cpu_s(20)
 
 
 def peak_bytes(log: cangauge.Log) -> int:
