@@ -1,4 +1,4 @@
-"""Limits of time that hold on any machine, beside any load."""
+"""Limits of processor time that hold on any machine, beside any load."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 REFERENCE_S = 0.025
 """Processor time of the reference task, on the processor for which limits are stated [s]."""
@@ -45,18 +44,3 @@ def at_most(seconds: float, what: str = "") -> Iterator[None]:
     took_s = time.process_time() - began_s
     if took_s > seconds / MUCH_FASTER:
         assert took_s < seconds * _slowness(), what
-
-
-def _idle_s() -> float:
-    """Return how long this thread has neither run nor been ready to run [s], but for a constant."""
-    ready = Path("/proc/thread-self/schedstat")
-    ready_s = int(ready.read_text().split()[1]) / 1e9 if ready.exists() else 0.0
-    return time.monotonic() - time.thread_time() - ready_s
-
-
-@contextmanager
-def sleeps_less_than(seconds: float) -> Iterator[None]:
-    """Fail where a block waits; what the processor needs for it, and for others, is left out."""
-    began_s = _idle_s()
-    yield
-    assert _idle_s() - began_s < seconds
