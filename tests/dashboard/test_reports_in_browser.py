@@ -21,6 +21,11 @@ pytestmark = MARKS
 
 FIT = ("-o", "model.json", "--capacity-ah", "51.5")
 WITH_MODEL = ("-m", "model.json")
+LEGENDS_ARE_WHOLE = """
+    const plots = Bokeh.index.roots.filter(each => each.model.type === "Figure");
+    const legends = plots.flatMap(each => each.model.above.map(it => each.views.find_one(it)));
+    return legends.every(each => each.bbox.width === 0 || each.bbox.left >= 0);
+"""
 
 
 def run(folder: Path, command: str, *arguments: str) -> None:
@@ -74,6 +79,7 @@ def test_a_report_fits_a_phone(page: Any) -> None:
     page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
         assert page.execute_script("return document.documentElement.scrollWidth") <= 400
+        assert waits(lambda: page.execute_script(LEGENDS_ARE_WHOLE))
     finally:
         page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
