@@ -132,6 +132,13 @@ def pack(nominal_v: float) -> Candidate:
     return search(frames({0x2A1: words}), nominal_v).candidates["voltage"][0]
 
 
+def test_a_rare_scale_of_some_bits_does_not_fit_a_stated_voltage_better() -> None:
+    amps = load(1) / 10.0
+    words = [raw(amps, 0.1, -500.0), raw(376.6 - 0.05 * amps, 0.1)]
+    voltage = search(frames({0x2A1: words}), nominal_v=360.0).candidates["voltage"][0]
+    assert (voltage.name, voltage.scale) == ("0x2A1 16|16@1+", 0.1)  # not its lower byte of 2 V
+
+
 def test_the_stated_voltage_decides_and_what_else_fits_is_listed() -> None:
     sure = pack(373.0)
     assert (sure.scale, sure.levels) == (0.05, ())

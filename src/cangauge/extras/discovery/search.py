@@ -313,16 +313,17 @@ def _as_soc(
 
 
 def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None) -> float:
-    """Return the log prior of a voltage's scale [nats]: a stated voltage decides it alone.
+    """Return the log prior of a voltage's scale [nats], by a stated voltage if there is one.
 
     Most cars have 250–450 V, and a full scale not far beyond.
     """
+    usual = VOLTAGE_SCALES[scale]
     if nominal_v is not None:
         # A pack's middle voltage lies within some per cent of the stated one.
-        return max(-0.5 * (math.log(volts / nominal_v) / 0.03) ** 2, IMPOSSIBLE)
+        return usual + max(-0.5 * (math.log(volts / nominal_v) / 0.03) ** 2, IMPOSSIBLE)
     level = {30: IMPOSSIBLE, 100: -2.2, 250: -1.5, 450: 0.0, 900: -1.2, math.inf: IMPOSSIBLE}
     full = {380: -1.0, 1400: 0.0, math.inf: -0.3 if scale <= 0.1 else -2.0}
-    return VOLTAGE_SCALES[scale] + _step(volts, level) + _step(scale * (1 << width), full)
+    return usual + _step(volts, level) + _step(scale * (1 << width), full)
 
 
 def _step(value: float, priors: Mapping[float, float]) -> float:
