@@ -378,6 +378,9 @@ def test_the_gauges_own_count_gives_the_capacity(pack: Pack) -> None:
     level = replace(logs[0], soc_pct=np.full(len(logs[0]), 50.0))
     with pytest.raises(cangauge.InputError, match="moves by 5 %"):
         cangauge.judge([level], chemistry="oxide", cells=96)
+    charges = replace(logs[0], current_a=-logs[0].current_a)
+    with pytest.raises(cangauge.InputError, match="the SoC rises as charge is drawn"):
+        cangauge.judge([charges], chemistry="oxide", cells=96)
 
 
 def test_logs_that_show_nothing_are_refused(pack: Pack) -> None:

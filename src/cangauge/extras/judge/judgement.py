@@ -101,6 +101,12 @@ def judge(
         if capacity_ah is None:  # as wrong as the scale of a gauge can be
             known = {**known, "capacity": FAULTS["count_scale"].stds[0]}
             capacity_ah = implied_capacity(judged).capacity_ah
+            if capacity_ah <= 0.0:
+                raise InputError(
+                    "charge and SoC contradict each other: the SoC rises as charge is drawn",
+                    field="current_a",
+                    cure="check the sign of the current (positive must discharge) and the SoC",
+                )
         pack = Model.prior(chemistry, cells, capacity_ah)
     else:
         raise InputError(
