@@ -45,7 +45,7 @@ def test_terminal_page_and_model_state_one_soc_range(trip: Path, tmp_path: Path)
     assert shown == (f"{low:.1f}", f"{high:.1f}")
     text = html.unescape(re.sub(r"<[^>]+>", " ", page.read_text(encoding="utf-8")))
     assert f"The logs cover {low:.1f} … {high:.1f} %" in text
-    sentence = f"Good from {low:.0f} to {high:.0f} % SoC"
+    sentence = f"Fitted from {low:.0f} to {high:.0f} % SoC"
     assert sentence in ran.out
     assert sentence in text
 

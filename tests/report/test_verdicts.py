@@ -61,13 +61,13 @@ def degraded(estimate: RecordedEstimate, *spans: tuple[int, int]) -> RecordedEst
 def test_fit_states_range_and_what_is_missing(found: Identification) -> None:
     text = found.verdict
     low, high = found.model.range.soc_pct  # as the terminal prints it
-    assert text.startswith(f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error ")
+    assert text.startswith(f"Fitted from {low:.0f} to {high:.0f} % SoC: mean voltage error ")
     assert f"on {found.model.noise.judged_on}. Add a drive below 42 % and above 87 %: " in text
 
 
 def test_fit_over_a_full_discharge_lacks_no_range() -> None:
     text = fit([synthetic_log(hours=1.2, noise_v=0.5, name="full")]).verdict
-    assert text.startswith("Good from 1 to 98 % SoC")
+    assert text.startswith("Fitted from 1 to 98 % SoC")
     assert "Add a drive" not in text
 
 

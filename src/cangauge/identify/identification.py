@@ -233,7 +233,7 @@ class Identification:
             )
         noise = self.model.noise
         error, on = number(noise.voltage_mae_pct, 2, "%"), noise.judged_on
-        text = f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error {error} on {on}."
+        text = f"Fitted from {low:.0f} to {high:.0f} % SoC: mean voltage error {error} on {on}."
         ends = [f"below {low:.0f} %"] if low > NEAR_AN_END_PCT else []
         ends += [f"above {high:.0f} %"] if high < 100.0 - NEAR_AN_END_PCT else []
         if ends:
