@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from cangauge._resources import shared_file
 from live import COMMAND, leaf_model_path
 
+SHIPPED = shared_file("replay", "leaf2012_reconstruction_10min.parquet")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a Unix shell")
 RUN = (
     "run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a", "--config",
@@ -31,6 +33,7 @@ def shell(
     ("arguments", "redirection", "code", "line"),
     [
         (("status", "--endpoint", "/absent", "--json"), ">&-", 1, "error: stdout is closed"),
+        (("inspect", SHIPPED), ">&-", 1, "error: stdout is closed"),
         (("status", "--endpoint", "/absent", "--json"), ">/dev/full", 1, "error: stdout: No space"),
         (("status", "--endpoint", "/absent"), "<&- >&- 2>&-", 1, ""),
         (("status", "--absent"), "<&- >&- 2>&-", 2, ""),

@@ -73,7 +73,13 @@ def print_remarks() -> None:
 
 def say(text: str) -> None:
     """Print lines of the result on stdout; on a terminal they are wrapped between words."""
-    _print(text, sys.stdout)
+    _print(text, _stdout())
+
+
+def _stdout() -> TextIO:
+    if sys.stdout is None:
+        raise CangaugeError("stdout is closed: the result cannot be printed")
+    return sys.stdout
 
 
 def _print(text: str, file: TextIO) -> None:
@@ -146,16 +152,15 @@ def finish(
 
 def emit_json(result: Mapping[str, Any]) -> None:
     """Print exactly one JSON object on stdout; NaN and infinities become null."""
-    if sys.stdout is None:
-        raise CangaugeError("stdout is closed: the result cannot be printed")
+    stdout = _stdout()
     content = plain(result)
     text = printable_json(json.dumps(content, ensure_ascii=False))
     try:
-        text.encode(sys.stdout.encoding or "utf-8")
+        text.encode(stdout.encoding or "utf-8")
     except UnicodeEncodeError:  # a terminal without these characters, or an undecodable file name
         text = json.dumps(content)
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    stdout.write(text + "\n")
+    stdout.flush()
 
 
 def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
@@ -175,7 +180,7 @@ def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -
 
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table of plain text on stdout; arguments as of `text_table`."""
-    PlainConsole(highlight=False).print(text_table(title, head, rows))
+    PlainConsole(file=_stdout(), highlight=False).print(text_table(title, head, rows))
 
 
 def known_rows(values: Mapping[str, str]) -> list[tuple[str, str]]:
