@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions
@@ -13,7 +15,7 @@ from typing import Any
 import pytest
 
 from cangauge import InputError, Log, _extras
-from live import in_process, leaf_model_path, refused
+from live import COMMAND, in_process, leaf_model_path, refused
 
 PYPROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
 
@@ -101,3 +103,13 @@ def test_a_figure_is_refused_too(absent: set[str]) -> None:
     )
     with pytest.raises(InputError, match=r"cangauge\[report\]"):
         log.plot()
+
+
+def test_a_light_install_names_what_a_command_needs() -> None:
+    code = f"import sys; sys.modules['pyarrow'] = None; {COMMAND}"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "inspect", "absent.csv"],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr == ("error: needs pyarrow, which is not installed; pip install cangauge\n")

@@ -22,7 +22,7 @@ from typer.main import get_command as build_command
 from cangauge._files import FULL
 from cangauge._version import __version__
 from cangauge.cli.output import emit_json, hold_remarks, note, print_remarks
-from cangauge.errors import CangaugeError, closest, in_our_words
+from cangauge.errors import CangaugeError, InputError, closest, in_our_words
 
 FIRST: Final = (
     "demo",
@@ -139,6 +139,11 @@ def main() -> None:
     except UsageError as error:
         line, field = _usage(error)
         code = _failed(line, {**CangaugeError(line).to_dict(), "field": field}, 2)
+    except ModuleNotFoundError as error:  # of a light install (docs/howto/raspberry-pi.md)
+        missing = InputError(
+            f"needs {error.name}, which is not installed", cure="pip install cangauge"
+        )
+        code = _failed(str(missing), missing.to_dict(), missing.exit_code)
     except OSError as error:
         if error.errno not in FULL:
             raise
