@@ -77,11 +77,16 @@ def test_a_log_with_absolute_times_is_drawn_within_its_axis(model: Model, known:
 def test_a_healthy_log_has_a_page_too(model: Model, known: Healthy) -> None:
     page = gap_page(diagnose([day(22)], model, known))
     assert page.lead.startswith("No significant gap")
-    assert "Beside healthy logs" in page.html()
+    html = page.html()
+    assert "Beside healthy logs" in html
+    assert "Mean SoC error with the start withheld: " in html
+    assert " %, corrected " not in html
 
 
 def test_a_log_of_some_minutes_has_a_page_too(model: Model, known: Healthy) -> None:
     log = day(21).rows(slice(500))
     found = diagnose([replace(log, voltage_v=log.voltage_v + 8.0)], model, known)
     assert not found.where  # too short to tell where the error lies
-    assert "How far it shrinks" in gap_page(found).html()
+    html = gap_page(found).html()
+    assert "How far it shrinks" in html
+    assert "Where else the error lies" not in html

@@ -82,7 +82,8 @@ def _shrinks(found: Diagnosis) -> Figure:
             caption += f" It closes {percent(closed)} of the squared gap above healthy logs."
     if found.soc_errors_pct is not None:
         before, after = (number(each, 2, "%") for each in found.soc_errors_pct)
-        caption += f" Mean SoC error with the start withheld: {before}, corrected {after}."
+        corrected = f", corrected {after}" if found.is_corrected else ""
+        caption += f" Mean SoC error with the start withheld: {before}{corrected}."
     return bars(title, "RMS error", entries, caption, unit="V")
 
 
