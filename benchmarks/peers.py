@@ -210,7 +210,7 @@ def draw(found: Result, path: Path) -> None:
         longest = max(row["us"].values(), default=1.0)
         axes.text(1.15 * longest, place, errors if row["mae_pct"] else "no filter", va="center")
     axes.set(
-        xscale="log", yticks=places, yticklabels=names, xlabel="time of a sample [µs]",
+        xscale="log", yticks=places, yticklabels=names, xlabel="processor time per sample [µs]",
         title="A sample with its estimate, and the mean error of the SoC",
     )  # fmt: skip
     axes.set_xlim(right=60.0 * axes.get_xlim()[1])
