@@ -155,7 +155,8 @@ def test_a_second_sender_is_an_error_or_loses_samples_that_are_counted() -> None
 
         def intrude() -> None:
             encoder = FrameEncoder(Vehicle.load("generic"))
-            for sample in itertools.cycle(samples_of(short_log(20.0))):
+            # As many as the log has: more would be a backlog of minutes on some runs.
+            for sample in samples_of(short_log(100.0)):
                 if stop.is_set():
                     return
                 for frame in encoder.encode(sample):
